@@ -35,12 +35,8 @@ LOOSELY = (
 """How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another. With fewer inner steps
 what is rounded otherwise in another batch moves people by a centimetre."""
 
-SHOWN = Settle(
-    iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, root=30.0, lift=10.0, stand=16.0, hold=10.0, hard=5.0
-)
-"""How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once.
-
-By limbs: whole people who are moved four frames at a time change speed at every token's border."""
+SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
+"""How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
 
 PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, lift=10.0, stand=16.0, hold=2.0, hard=20.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
