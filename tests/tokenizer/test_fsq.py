@@ -11,6 +11,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from magnet.tokenizer.base import PoseTokenizer
+from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.fsq import FSQ
 from magnet.tokenizer.module import Tokenizer
 from magnet.tokenizer.options import QuantizerOptions
@@ -129,7 +130,7 @@ def test_both_models_train_on_it_by_flags_and_a_checkpoint_brings_it_back(tmp_pa
     kind = ("--model", "Denoiser", "--model.tokenizer", "tok/checkpoints/last.ckpt")
     assert cli.main(["fit", *kind, *small, *data, *two, "--out", "den"]) == 0
     trained, loaded = Tokenizer.load("tok/checkpoints/last.ckpt"), Denoiser.load("den/checkpoints/last.ckpt")
-    assert isinstance(loaded.tokenizer, Tokenizer) and isinstance(loaded.tokenizer.quantizer, FSQ)
+    assert isinstance(loaded.tokenizer, TokenizerCore) and isinstance(loaded.tokenizer.quantizer, FSQ)
     assert loaded.tokenizer.quantizer.levels == (5, 5, 4) and loaded.layout.latent == 3
     for name, value in trained.state_dict().items():
         assert torch.equal(loaded.tokenizer.state_dict()[name], value), name
