@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import magnet
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.sampling.options import SamplerOptions
 from tests.cases import some_slow
 
@@ -60,7 +60,7 @@ def files(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_the_python_of_a_page_runs(page: Path, model, files: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(magnet, "load", lambda *_, **__: model)
-    monkeypatch.setattr(Denoiser, "load", lambda *_: model.denoiser)
+    monkeypatch.setattr(DenoiserCore, "load", lambda *_: model.denoiser)
     monkeypatch.setattr("magnet.generation.live.SamplerOptions", functools.partial(SamplerOptions, steps=1))
     here: dict[str, object] = {}
     for block in blocks(page):

@@ -169,9 +169,8 @@ class Body(nn.Module):
                 R = R @ body_rot.index_select(-3, mine)
                 Rs.append(R)
                 ts.append(t)
-            lead = np.broadcast_shapes(
-                Rs[-1].shape[:-3], ts[-1].shape[:-2]
-            )  # torch's imports sympy, which takes a second
+            # NumPy's, because torch's imports SymPy: 34 MiB.
+            lead = np.broadcast_shapes(Rs[-1].shape[:-3], ts[-1].shape[:-2])
             Rs = [level.expand(*lead, *level.shape[-3:]) for level in Rs]
             ts = [level.expand(*lead, *level.shape[-2:]) for level in ts]
             return torch.cat(Rs, dim=-3).index_select(-3, order), torch.cat(ts, dim=-2).index_select(-2, order)

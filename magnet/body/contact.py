@@ -16,9 +16,6 @@ FOREARMS = (7, 8)
 TOUCH = 0.05
 """Depth in metres under which capsules only touch."""
 
-CHUNK = 8192
-"""Pairs of bodies looked at together, to bound memory."""
-
 ARMS = slice(5, 9)
 """Capsules of upper arms and forearms, next to each other in `CAPSULES`."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +23,6 @@ from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.training.optim import warmup_cosine
-
-Target = Literal["quantized", "continuous"]
 
 
 class Denoiser(DenoiserCore, TokenModel):

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 
 from magnet import checkpoints
-from magnet.body import Body
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import FEW_SLOTS
 from magnet.motion.scene import Scene
@@ -45,7 +44,6 @@ class TokenModelCore(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self._tokenizer_digest: str | None = None
-        self._body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
 
     def keep(self, options: dict[str, Any]) -> None:
         """Keep the options it was built with as `hparams`."""

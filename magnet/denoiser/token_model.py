@@ -19,6 +19,8 @@ from magnet.tokenizer.core import TokenizerCore
 class TokenModel(TokenModelCore, L.LightningModule):
     """Base of networks that are trained to predict motion tokens: `TokenModelCore` as a LightningModule."""
 
+    _body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
+
     def keep(self, options: dict[str, Any]) -> None:
         # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
         self.save_hyperparameters(options)

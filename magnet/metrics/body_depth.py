@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from magnet.body.contact import CHUNK, DEEP, TOUCH, deepest
+from magnet.body.contact import DEEP, TOUCH, deepest
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
 from magnet.metrics.interval import histogram_of, quantile
+from magnet.metrics.penetration import CHUNK
 
 KINDS = ("depth", "depth_body", "depth_arms")
 

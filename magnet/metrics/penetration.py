@@ -8,10 +8,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from magnet.body.contact import CHUNK, penetration_depth
+from magnet.body.contact import penetration_depth
 from magnet.metrics.base import ClipMeans
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
+
+CHUNK = 8192
+"""Pairs of bodies looked at together, to bound memory."""
 
 
 class Interpenetration(ClipMeans):

@@ -8,7 +8,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.checkpoints import FOLDER
-from magnet.denoiser.module import Denoiser
+from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats, save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
@@ -173,7 +173,7 @@ def test_files_may_stand_behind_options() -> None:
 def test_what_is_wrong_without_a_model_is_said_before_one_is_loaded(
     words: list[str], message: str, duet, tmp_path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr(Denoiser, "load", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr(DenoiserCore, "load", lambda *_: pytest.fail("a model was loaded"))
     words = [duet["ours"][0] if word == "OURS" else word for word in words]
     assert cli.main(["predict", *words, "--out", str(tmp_path / "out.npz")]) != 0
     assert message in capsys.readouterr().err

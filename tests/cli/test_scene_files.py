@@ -66,7 +66,7 @@ def test_an_input_is_safe_from_people_who_are_counted_only_when_it_is_read(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A partner is added, samples get a file each, and so do scenes of SMPL-X's keys."""
-    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
     scene = Scene.load("duet.npz")
     scene.repeat(2).replace(names=()).save("two_scene1.npz")
     save_bvh(scene, "take_scene1.bvh", load_body())
@@ -148,7 +148,7 @@ def test_a_format_whose_writer_is_not_here_is_refused_first(
 def test_a_place_that_takes_no_file_is_said_before_anything_is_made(
     words: list[str], folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
     monkeypatch.setattr("magnet.body.repair.repaired", lambda *_, **__: pytest.fail("computed"))
     Path("file").write_text("no folder")
     names = [word.replace("OUT", "file/out") for word in words]

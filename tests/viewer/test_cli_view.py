@@ -140,7 +140,7 @@ def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
 def test_a_recording_that_needs_a_past_is_refused_before_a_model_is_loaded(
     tmp_path: Path, duet: Scene, capsys, monkeypatch
 ) -> None:
-    monkeypatch.setattr("magnet.denoiser.module.Denoiser.load", lambda *_: pytest.fail("a model was loaded"))
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
     path = duet.save(tmp_path / "a.npz")
     assert main(["view", str(path), "--record", str(tmp_path / "r.npz"), "--port", "0"]) == 2
     assert "--record, of which --context 0 frames are given: joint_future" in capsys.readouterr().err
