@@ -57,7 +57,7 @@ def answers(steps: int, span: int = 10) -> dict[int, float]:
     """A live answer of the shipped model after so many others, the median of `span`."""
     model = magnet.load("duet").denoiser
     past = standing(1, 32, 2, model.device)
-    how = SamplerOptions(steps=steps, any_floor=True)
+    how = SamplerOptions(steps=steps)
     partner, coming = Partner(model, past, (0,), how), past.slice(past.frames - TOKEN_FRAMES)
     times = []
     for _ in range(max(PAST) + span):

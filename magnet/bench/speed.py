@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from magnet.body.floor import on_floor
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.rollout import stream
 from magnet.generation.stats import SamplingStats
@@ -137,16 +137,17 @@ def paper_model(max_agents: int = 4, seed: int = 0) -> DenoiserCore:
 
 
 def standing(batch: int, frames: int, people: int, device: torch.device) -> Scene:
-    """People who stand in a row, 1 m apart: what is computed does not depend on how they move."""
+    """People who stand on the floor in a row, 1 m apart: what a network costs does not depend on how they move.
+
+    What corrections cost does: people under the floor are lifted in every block.
+    """
     like = torch.zeros((), device=device)
     scene = empty_scene(batch, frames, people, like)
     place = torch.stack([torch.arange(people) * 1.0, torch.zeros(people)], dim=-1)
     roots = from_planar(torch.zeros(people), place).to(device)
-    return scene.replace(
-        T_world_root=roots.expand(batch, frames, people, 4, 4).clone(),
-        body_rot=scene.body_rot.clone(),
-        present=torch.ones(batch, people, dtype=torch.bool, device=device),
-    )
+    there = torch.ones(batch, people, dtype=torch.bool, device=device)
+    roots = roots.expand(batch, frames, people, 4, 4).clone()
+    return on_floor(scene.replace(T_world_root=roots, body_rot=scene.body_rot.clone(), present=there))
 
 
 def measure(
@@ -175,7 +176,6 @@ def measure(
     task = registry.get(case.task)(**dict(case.options))
     context = 0 if case.task in FROM_NOTHING else CONTEXT
     scene = standing(case.batch, context + frames, case.people, model.device)
-    options = dataclasses.replace(options, any_floor=True)
     timings: list[dict[str, float]] = []
     for _ in range(rounds + 1):
         stats = SamplingStats()
@@ -291,7 +291,6 @@ def live_latency(model: DenoiserCore, options: SamplerOptions, seconds: float, p
     from magnet.generation.partner import Partner
 
     past = standing(1, CONTEXT, people, model.device)
-    options = dataclasses.replace(options, any_floor=True)
     partner = Partner(model, past, (0,), options, torch.Generator(model.device).manual_seed(0))
     coming = past.slice(CONTEXT - TOKEN_FRAMES)
     period = TOKEN_FRAMES / past.fps

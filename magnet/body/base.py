@@ -160,20 +160,19 @@ class Body(nn.Module):
         parents, depths, order = _tree(rest_joints.device)
         # By tensors that are kept: lists of indices would become tensors at every call, and once more for gradients.
         offset = (rest_joints[..., 1:, :] - rest_joints.index_select(-2, parents))[..., None]
+        # NumPy's, because torch's imports SymPy: 34 MiB.
+        lead = np.broadcast_shapes(body_rot.shape[:-3], T_world_root.shape[:-2], rest_joints.shape[:-2])
+        step = torch.cat([body_rot.expand(*lead, -1, 3, 3), offset.expand(*lead, -1, 3, 1)], dim=-1)
         with _exact(body_rot):
-            R, t = T_world_root[..., None, :3, :3], T_world_root[..., None, :3, 3]
-            Rs, ts = [R], [t]
+            level = T_world_root[..., None, :3, :].expand(*lead, 1, 3, 4)
+            levels = [level]
             for mine, parent in depths:
-                R, t = R.index_select(-3, parent), t.index_select(-2, parent)
-                t = t + (R @ offset.index_select(-3, mine))[..., 0]
-                R = R @ body_rot.index_select(-3, mine)
-                Rs.append(R)
-                ts.append(t)
-            # NumPy's, because torch's imports SymPy: 34 MiB.
-            lead = np.broadcast_shapes(Rs[-1].shape[:-3], ts[-1].shape[:-2])
-            Rs = [level.expand(*lead, *level.shape[-3:]) for level in Rs]
-            ts = [level.expand(*lead, *level.shape[-2:]) for level in ts]
-            return torch.cat(Rs, dim=-3).index_select(-3, order), torch.cat(ts, dim=-2).index_select(-2, order)
+                up = level.index_select(-3, parent)
+                level = up[..., :3] @ step.index_select(-3, mine)
+                level[..., 3] += up[..., 3]
+                levels.append(level)
+            whole = torch.cat(levels, dim=-3).index_select(-3, order)
+            return whole[..., :3], whole[..., 3]
 
 
 def _exact(like: Tensor) -> torch.autocast:

@@ -159,7 +159,7 @@ class Smoothness:
         self.cost = whole.to(like)[self.lead :]  # (T, L + T)
         keep = free.transpose(1, 2)  # (B, P, T)
         self.free = keep[..., None] & keep[..., None, :]
-        self.undone = self.inverse(0.0)  # (B, P, T, T)
+        self.undone = self.inverse(0.0) * self.free  # (B, P, T, T), 0 for whoever is fixed
 
     def inverse(self, pull: float) -> Tensor:
         """Inverse of one number's cost with `pull` added for each frame. -> (B, P, T, T)"""
@@ -180,13 +180,13 @@ class Smoothness:
 
     def __call__(self, offset: Tensor) -> Tensor:
         """The cost's matrix times an offset. (B, T, P, DOFS) -> same"""
-        return torch.einsum("st,btpd->bspd", self.cost[:, self.lead :], offset) * self.scale
+        return (self.cost[:, self.lead :] @ offset.flatten(2)).view_as(offset) * self.scale
 
     def slope(self, offset: Tensor) -> Tensor:
         """The gradient of the cost, the past's corrections included, with `start` free. (B, T, P, DOFS) -> same"""
         offset = offset - self.start
         whole = offset if self.past is None else torch.cat([self.past, offset], dim=1)
-        return torch.einsum("st,btpd->bspd", self.cost, whole) * self.scale
+        return (self.cost @ whole.flatten(2)).view_as(offset) * self.scale
 
     def undo(self, force: Tensor) -> Tensor:
         """The inverse of the cost's matrix times a force. (B, T, P, DOFS) -> same"""
@@ -194,7 +194,7 @@ class Smoothness:
 
 
 def solve(
-    residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, free: Tensor, inner: int
+    residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, inner: int
 ) -> Tensor:
     """One Gauss-Newton step. -> (B, T, P, DOFS)
 
@@ -205,7 +205,6 @@ def solve(
         residuals: M of them.
         first, second: (M, DOFS) their slopes at either end, times the square root of the weight.
         offset: (B, T, P, DOFS) the correction so far.
-        free: (B, T, P) bool, who may move.
     """
     a, b, step = residuals.node, residuals.other, torch.zeros_like(offset)
     for _ in range(ROUNDS):
@@ -213,57 +212,57 @@ def solve(
         moved = (first * flat[a]).sum(-1) - (second * flat[b]).sum(-1)
         after = residuals.value + moved / residuals.root_weight
         share = torch.where(residuals.one_sided, (after / SOFT / 2 + 0.5).clamp(0, 1), 1.0)
-        counts = share > 0
-        some, share = residuals.kept(counts), share[counts]
-        some = replace(some, root_weight=some.root_weight * share)
-        slopes = first[counts] * share[:, None], second[counts] * share[:, None]
-        step = least_squares(some, *slopes, smooth, offset, step, free, inner // ROUNDS)
+        counts = share.nonzero()[:, 0]
+        share = share[counts]
+        short = residuals.value[counts] * (residuals.root_weight[counts] * share)
+        node = torch.cat([a[counts], b[counts]])
+        slope = torch.cat([first[counts] * share[:, None], -second[counts] * share[:, None]])
+        step = least_squares(short, node, slope, smooth, offset, step, inner // ROUNDS)
     return step
 
 
 def least_squares(
-    residuals: Residuals,
-    first: Tensor,
-    second: Tensor,
+    short: Tensor,
+    node: Tensor,
+    slope: Tensor,
     smooth: Smoothness,
     offset: Tensor,
     step: Tensor,
-    free: Tensor,
     inner: int,
 ) -> Tensor:
     """The step that all residuals count for, by preconditioned conjugate gradients from a first guess `step`.
 
-    Arguments as for `solve`.
+    Args:
+        short: (M,) residuals times the square root of their weights.
+        node, slope: (2 M,), (2 M, DOFS) the node at one end of each residual and its slope there, then at the other.
+        smooth, offset, step, inner: as for `solve`.
     """
-    shape, keep = offset.shape, free[..., None].to(offset)
-    a, b = residuals.node, residuals.other
+    shape, M = offset.shape, len(short)
 
     def across(x: Tensor) -> Tensor:
-        flat = x.reshape(-1, DOFS)
-        return (first * flat[a]).sum(-1) - (second * flat[b]).sum(-1)
+        return (slope * x.reshape(-1, DOFS).index_select(0, node)).sum(-1).view(2, M).sum(0)
 
     def back(u: Tensor) -> Tensor:
-        flat = offset.new_zeros(shape).view(-1, DOFS)
-        flat.index_add_(0, a, first * u[:, None]).index_add_(0, b, -second * u[:, None])
-        return flat.view(shape)
+        force = slope * u.expand(2, M).reshape(-1, 1)
+        return torch.zeros_like(offset).view(-1, DOFS).index_add_(0, node, force).view(shape)
 
     def product(x: Tensor, y: Tensor) -> Tensor:
         """Scene by scene, so that scenes do not depend on each other. -> (B, 1, 1, 1)"""
         return (x * y).sum(dim=(1, 2, 3), keepdim=True)
 
-    gradient = back(residuals.root_weight * residuals.value + across(step)) + smooth.slope(offset) + smooth(step)
-    residual = -gradient * keep
-    z = smooth.undo(residual) * keep
+    gradient = back(short + across(step)) + smooth.slope(offset) + smooth(step)
+    residual = -gradient
+    z = smooth.undo(residual)
     direction, rz = z, product(residual, z)
     for _ in range(inner):
         going = rz > DONE
         if not bool(going.any()):
             break
-        turned = (back(across(direction)) + smooth(direction)) * keep
+        turned = back(across(direction)) + smooth(direction)
         length = torch.where(going, rz / product(direction, turned).clamp_min(1e-20), 0.0)
         step = step + length * direction
         residual = residual - length * turned
-        z = smooth.undo(residual) * keep
+        z = smooth.undo(residual)
         rz, before = product(residual, z), rz
         direction = z + torch.where(going, rz / before.clamp_min(1e-20), 0.0) * direction
     return step
@@ -322,6 +321,7 @@ def correct_window(
     offset = scene.T_world_root.new_zeros(B, T, P, DOFS)
     if not bool(free.any()):
         return offset
+    wishes = wishes.of_those(free)
     ramp = begun and past is None
     if ramp:
         past = offset.new_zeros(B, LEAD, P, DOFS)
@@ -349,7 +349,7 @@ def correct_window(
         )
         second = jacobian(seen, residuals.other, residuals.other_bone, residuals.other_point, residuals.along)
         second = second * (residuals.root_weight * residuals.two)[:, None]
-        step = solve(residuals, first, second, smooth, offset, free, settle.inner)
+        step = solve(residuals, first, second, smooth, offset, settle.inner)
         size = step.abs().amax(dim=(1, 2, 3), keepdim=True)
         offset = offset + step * (settle.most / size.clamp_min(settle.most))
     return offset

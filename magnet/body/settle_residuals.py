@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from magnet.body.capsules import nearest_points
-from magnet.body.energy import allowed_between_measured, allowed_within, hand_points
+from magnet.body.energy import Contact, allowed_between_measured, allowed_within, hand_points
 from magnet.body.fitted_capsules import FittedCapsules
 from magnet.body.joints import FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
@@ -94,18 +95,21 @@ def all_residuals(
     hold: float = 1.0,
     hard: float = 1.0,
 ) -> Residuals:
-    """All unmet wishes of people who can move. free (B, T, P) bool; stand, hold, hard: see `Settle`."""
-    parts = [
-        weighted(between_residuals(seen, capsules, wishes), hard),
-        within_residuals(seen, capsules, wishes),
-        weighted(hold_residuals(seen, wishes), hold),
-        stand_residuals(seen, wishes, stand),
-        height_residuals(seen, wishes),
-        floor_residuals(seen, wishes),
-        weighted(float_residuals(seen, wishes), hard),
-    ]
-    residuals, can = cat(parts), free.flatten()
-    return residuals.kept(can[residuals.node] | (can[residuals.other] & (residuals.two > 0)))
+    """All unmet wishes of people who can move.
+
+    wishes: `Wishes.of_those` who are free (B, T, P) bool; stand, hold, hard: see `Settle`.
+    """
+    return cat(
+        [
+            weighted(between_residuals(seen, capsules, wishes, free), hard),
+            within_residuals(seen, capsules, wishes, free),
+            weighted(hold_residuals(seen, wishes), hold),
+            stand_residuals(seen, wishes, stand),
+            height_residuals(seen, wishes),
+            floor_residuals(seen, wishes, free),
+            weighted(float_residuals(seen, wishes, free), hard),
+        ]
+    )
 
 
 def weighted(residuals: Residuals, factor: float) -> Residuals:
@@ -113,15 +117,24 @@ def weighted(residuals: Residuals, factor: float) -> Residuals:
     return replace(residuals, root_weight=residuals.root_weight * factor**0.5)
 
 
-def touching(
-    seen: Seen, capsules: FittedCapsules, pairs: tuple[Tensor, Tensor, Tensor, Tensor], allowed: Tensor, kind: str
-) -> Residuals:
-    """Residuals of capsules deeper than allowed, or nearly so.
+@functools.cache
+def limits(kind: str, contact: Contact, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Depths (K, K) in metres that are allowed, and the L pairs of capsules that have a limit, (L,) int x 2.
 
-    pairs: (M,) b, t and the two people; allowed (K, K) metres, for the first K capsules.
+    Kept, because every step of every correction asks for them.
     """
+    with torch.inference_mode(False):
+        allowed = (allowed_between_measured if kind == "between" else allowed_within)(contact).to(device)
+        i, j = allowed.isfinite().nonzero(as_tuple=True)
+    return allowed, i, j
+
+
+def touching(
+    seen: Seen, capsules: FittedCapsules, pairs: tuple[Tensor, Tensor, Tensor, Tensor], contact: Contact, kind: str
+) -> Residuals:
+    """Residuals of capsules deeper than allowed, or nearly so. pairs: (M,) b, t and the two people"""
     b, t, p, q = pairs
-    i, j = allowed.isfinite().nonzero(as_tuple=True)
+    allowed, i, j = limits(kind, contact, b.device)
     bones = torch.tensor(capsules.bones, device=b.device)
     K = len(allowed)
     one, other = seen.ends[b, t, p, :K], seen.ends[b, t, q, :K]  # (M, K, 2, 3)
@@ -134,11 +147,12 @@ def touching(
     depth = reach[0][m, i] + reach[1][m, j] - length - reach[2][i, j]
     near = depth > -NEAR
     m, i, j, first, second, apart, length, depth = (x[near] for x in (m, i, j, first, second, apart, length, depth))
-    pelvis = (seen.by_frame[b[m], t[m], p[m], 0] - seen.by_frame[b[m], t[m], q[m], 0]) * torch.tensor(
-        [1.0, 0.0, 1.0]
-    ).to(one)
-    across = off_axis(pelvis, one[m, i, 1] - one[m, i, 0])
-    away = torch.where((length > 0.005)[:, None], apart / length.clamp_min(0.005)[:, None], across)
+    away, cross = apart / length.clamp_min(0.005)[:, None], length <= 0.005
+    if bool(cross.any()):
+        pelvis = (seen.by_frame[b[m], t[m], p[m], 0] - seen.by_frame[b[m], t[m], q[m], 0]) * torch.tensor(
+            [1.0, 0.0, 1.0]
+        ).to(one)
+        away = torch.where(cross[:, None], off_axis(pelvis, one[m, i, 1] - one[m, i, 0]), away)
     node, others = seen.node(b, t, p)[m], seen.node(b, t, q)[m]
     # The value is the depth; moving along `away` reduces it.
     return residuals_of(kind, node, bones[i], first, -away, depth, (others, bones[j], second))
@@ -170,15 +184,14 @@ def off_axis(pelvis: Tensor, axis: Tensor) -> Tensor:
     return torch.nn.functional.normalize(across + 0.1 * beside + 1e-6 * axes(1, axis)[0], dim=-1)
 
 
-def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Residuals:
-    """Depth between people."""
-    allowed = allowed_between_measured(wishes.contact).to(seen.joints.device)
+def between_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
+    """Depth between people, not both of whom are fixed."""
     first, second = pairs_of(seen)
     pelvis = seen.by_frame[..., 0, :]
     near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < REACH
-    both = (wishes.present[:, first] & wishes.present[:, second])[:, None]
+    both = (wishes.present[:, first] & wishes.present[:, second])[:, None] & (free[..., first] | free[..., second])
     b, t, pair = (near & both).nonzero(as_tuple=True)
-    return touching(seen, capsules, (b, t, first[pair], second[pair]), allowed, "between")
+    return touching(seen, capsules, (b, t, first[pair], second[pair]), wishes.contact, "between")
 
 
 def pairs_of(seen: Seen) -> tuple[Tensor, Tensor]:
@@ -188,11 +201,10 @@ def pairs_of(seen: Seen) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def within_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes) -> Residuals:
+def within_residuals(seen: Seen, capsules: FittedCapsules, wishes: Wishes, free: Tensor) -> Residuals:
     """Depth of each body in itself."""
-    b, t, p = wishes.everybody(seen.by_frame.shape[1]).nonzero(as_tuple=True)
-    allowed = allowed_within(wishes.contact).to(seen.joints.device)
-    return touching(seen, capsules, (b, t, p, p), allowed, "within")
+    b, t, p = free.nonzero(as_tuple=True)
+    return touching(seen, capsules, (b, t, p, p), wishes.contact, "within")
 
 
 def axes(count: int, like: Tensor) -> Tensor:
@@ -261,21 +273,21 @@ def height_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     return residuals_of("height", seen.node(b, t, p), toes, point, up, point[:, 1] - wishes.heights[b, t, p, i])
 
 
-def floor_residuals(seen: Seen, wishes: Wishes) -> Residuals:
+def floor_residuals(seen: Seen, wishes: Wishes, free: Tensor) -> Residuals:
     """Soles are not under the floor."""
     feet = torch.tensor(FEET, device=seen.joints.device)
     depth = wishes.clearance[:, None] - seen.by_frame[..., FEET, 1]  # (B, T, P, 4)
-    b, t, p, i = ((depth > -NEAR) & wishes.everybody(depth.shape[1])[..., None]).nonzero(as_tuple=True)
+    b, t, p, i = ((depth > -NEAR) & free[..., None]).nonzero(as_tuple=True)
     down = -axes(1, depth)[1].expand(len(b), 3)
     return residuals_of("floor", seen.node(b, t, p), feet[i], seen.by_frame[b, t, p, feet[i]], down, depth[b, t, p, i])
 
 
-def float_residuals(seen: Seen, wishes: Wishes) -> Residuals:
+def float_residuals(seen: Seen, wishes: Wishes, free: Tensor) -> Residuals:
     """The lower foot of a floating person comes down to the floor, and nobody's rises."""
     height = seen.by_frame[..., FEET, 1] - wishes.clearance[:, None]
     lowest, which = height.min(dim=-1)
     over = lowest - wishes.highest
-    b, t, p = ((over > -NEAR) & wishes.everybody(over.shape[1])).nonzero(as_tuple=True)
+    b, t, p = ((over > -NEAR) & free).nonzero(as_tuple=True)
     feet = torch.tensor(FEET, device=b.device)[which[b, t, p]]
     up = axes(1, height)[1].expand(len(b), 3)
     return residuals_of("float", seen.node(b, t, p), feet, seen.by_frame[b, t, p, feet], up, over[b, t, p])

@@ -108,9 +108,17 @@ class Wishes:
             CONTACT[FIRM.get(how, how)], scene.present, above, stands, stood, heights, highest, held, between, scene.fps
         )
 
-    def everybody(self, frames: int) -> Tensor:
-        """Who is there, by frame. -> (B, T, P) bool"""
-        return self.present[:, None].expand(-1, frames, -1)
+    def of_those(self, free: Tensor) -> Wishes:
+        """The wishes that somebody who is free has a part in. free (B, T, P) bool"""
+        first, second = torch.combinations(torch.arange(free.shape[2], device=free.device)).unbind(dim=1)
+        either = (free[..., first] | free[..., second])[..., None, None]
+        return replace(
+            self,
+            stands=self.stands & (free[:, 1:] | free[:, :-1])[..., None],
+            stood=None if self.stood is None else torch.where(free[:, 0, :, None, None], self.stood, torch.nan),
+            heights=torch.where(free[..., None], self.heights, torch.nan),
+            held=self.held & either,
+        )
 
     def slice(self, start: int, stop: int) -> Wishes:
         """The wishes of the frames [start, stop)."""
