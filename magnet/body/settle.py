@@ -6,6 +6,7 @@ fixed frames and people stay bit-identical.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -64,6 +65,7 @@ class Settle:
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
         hold: factor for the cost of held hands that part.
+        pull: metres that held hands may be off before they pull no harder: a hand far away shall not jerk the body.
         hard: factor for the cost of what must not be: depth between people, feet over the floor.
     """
 
@@ -78,6 +80,7 @@ class Settle:
     most: float = 0.15
     stand: float = 1.0
     hold: float = 1.0
+    pull: float = math.inf
     hard: float = 1.0
 
 
@@ -337,7 +340,7 @@ def correct_window(
         now = corrected(scene, offset)
         R_world, joints = body.bone_chain(now.body_rot, now.T_world_root, rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)
-        residuals = all_residuals(seen, capsules, wishes, free, settle.stand, settle.hold, settle.hard)
+        residuals = all_residuals(seen, capsules, wishes, free, settle.stand, settle.hold, settle.pull, settle.hard)
         if not len(residuals.node):
             break
         if ramp:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -93,17 +94,18 @@ def all_residuals(
     free: Tensor,
     stand: float = 1.0,
     hold: float = 1.0,
+    pull: float = math.inf,
     hard: float = 1.0,
 ) -> Residuals:
     """All unmet wishes of people who can move.
 
-    wishes: `Wishes.of_those` who are free (B, T, P) bool; stand, hold, hard: see `Settle`.
+    wishes: `Wishes.of_those` who are free (B, T, P) bool; stand, hold, pull, hard: see `Settle`.
     """
     return cat(
         [
             weighted(between_residuals(seen, capsules, wishes, free), hard),
             within_residuals(seen, capsules, wishes, free),
-            weighted(hold_residuals(seen, wishes), hold),
+            weighted(hold_residuals(seen, wishes, pull), hold),
             stand_residuals(seen, wishes, stand),
             height_residuals(seen, wishes),
             floor_residuals(seen, wishes, free),
@@ -112,8 +114,8 @@ def all_residuals(
     )
 
 
-def weighted(residuals: Residuals, factor: float) -> Residuals:
-    """The residuals with their cost times a factor."""
+def weighted(residuals: Residuals, factor: float | Tensor) -> Residuals:
+    """The residuals with their cost times a factor, one or (M,)."""
     return replace(residuals, root_weight=residuals.root_weight * factor**0.5)
 
 
@@ -212,8 +214,8 @@ def axes(count: int, like: Tensor) -> Tensor:
     return torch.eye(3).to(like).repeat(count, 1)
 
 
-def hold_residuals(seen: Seen, wishes: Wishes) -> Residuals:
-    """Hands that hold each other keep their distance vector."""
+def hold_residuals(seen: Seen, wishes: Wishes, pull: float = math.inf) -> Residuals:
+    """Hands that hold each other keep their distance vector; farther off than `pull` metres they pull no harder."""
     wrists = torch.tensor(WRISTS, device=seen.joints.device)
     hands, (first, second) = hand_points(seen.by_frame), pairs_of(seen)
     b, t, pair, i, j = wishes.held.nonzero(as_tuple=True)
@@ -223,7 +225,10 @@ def hold_residuals(seen: Seen, wishes: Wishes) -> Residuals:
     node, bone, end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, p), wrists[i], point))
     others, other_bone, other_end = (x.repeat_interleave(3, dim=0) for x in (seen.node(b, t, q), wrists[j], other))
     reach = (others, other_bone, other_end)
-    return residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach)
+    residuals = residuals_of("hold", node, bone, end, axes(len(b), off), off.flatten(), reach)
+    if math.isinf(pull):
+        return residuals
+    return weighted(residuals, (pull / off.norm(dim=-1).clamp_min(pull)).repeat_interleave(3))
 
 
 def stand_residuals(seen: Seen, wishes: Wishes, cost: float = 1.0) -> Residuals:

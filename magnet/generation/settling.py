@@ -35,11 +35,34 @@ LOOSELY = (
 """How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another. With fewer inner steps
 what is rounded otherwise in another batch moves people by a centimetre."""
 
-SHOWN = Settle(iterations=4, inner=16, stay=2.0, speed=1.0, bend=2500.0, lift=10.0, stand=16.0, hold=2.0, hard=5.0)
-"""How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once."""
+SHOWN = Settle(
+    iterations=4,
+    inner=16,
+    stay=2.0,
+    speed=1.0,
+    bend=2500.0,
+    root=30.0,
+    lift=10.0,
+    stand=48.0,
+    hold=10.0,
+    pull=0.1,
+    hard=20.0,
+)
+"""How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once.
 
-PRESSED = Settle(iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, lift=10.0, stand=16.0, hold=2.0, hard=20.0)
-"""How they are corrected where that leaves somebody deep in another (`LEFT`): with a jerk if need be."""
+Whole people are hardly moved, because who is moved four frames at a time changes speed at every border; arms reach
+(docs/experiments_corrections.md).
+"""
+
+PRESSED = Settle(
+    iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, root=1.0, lift=10.0, stand=16.0, hold=2.0, hard=40.0
+)
+"""How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way, with a jerk if need
+be."""
+
+REMEMBERED = 60
+"""Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in
+CMU's salsa 9 are shorter."""
 
 REACH = 6
 """Frames before and after a moment that is corrected more loosely."""
@@ -135,11 +158,11 @@ def settled_block(
 class Corrected(NamedTuple):
     """How the last frames of a chunk or block were corrected, for the next one.
 
-    `holding` are hands that held in the last frame of a chunk, or in the last before a block; None: nobody asks.
+    `parted` tells how long ago hands held, at the end of a chunk or before a block; None: nobody asks.
     """
 
     offset: Tensor  # (B, 2, P, DOFS) the corrections of the last two
-    holding: Tensor | None  # (B, Q, 2, 2) bool
+    parted: Tensor | None  # (B, Q, 2, 2) frames; 0: they hold; infinite: they never did
     who: tuple[int, ...]  # the slots of these hands, and of a chunk's P people
 
 
@@ -161,7 +184,8 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     who, begun = tuple(there.tolist()), past is not None
     past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
-    offset, holding = (None, None) if past is None else past[:2]
+    offset, parted = (None, None) if past is None else past[:2]
+    holding = None if parted is None else parted == 0
     still = fixed[..., there.to(fixed.device)]
     before = offset
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
@@ -177,15 +201,16 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
         loose = settling(few, body, how, stay, looser, begun, past_few, holding=held_few)
         offset[deep] = torch.lerp(offset[deep], loose, around(frames[deep])[..., None, None].to(loose))
         made = corrected(shaped, offset)
-    held = hands_held(made, body) if how == "hold" else None
+    held = since_held(holds(body.joints(made), made.present)[0][:, -1:]) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
     body_rot[:, :, there], root[:, :, there] = made.body_rot, made.T_world_root
     return scene.replace(body_rot=body_rot, T_world_root=root), Corrected(offset[:, -2:], held, who)
 
 
-def hands_held(scene: Scene, body: Body) -> Tensor:
-    """Which hands hold in a scene's last frame. -> (B, Q, 2, 2) bool"""
-    return holds(body.joints(scene.slice(scene.frames - 1)), scene.present)[0][:, -1]
+def since_held(held: Tensor) -> Tensor:
+    """Frames since hands held, at the end of some; infinite: they never did. (B, T, Q, 2, 2) bool -> (B, Q, 2, 2)"""
+    ago = torch.arange(held.shape[1] - 1, -1, -1, device=held.device, dtype=torch.float32)[:, None, None, None]
+    return torch.where(held, ago, torch.inf).amin(dim=1)
 
 
 def own_correction(
@@ -263,7 +288,8 @@ def settled_on(
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    holding = None if known is None or how != "hold" else held_on(known, body, past, who)
+    parted = None if known is None or how != "hold" else parted_for(known, body, past, who, block)
+    holding = None if parted is None else parted <= REMEMBERED
     plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
     last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
     turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
@@ -279,7 +305,7 @@ def settled_on(
     whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     whole[:, :, there] = offset
     made = corrected(scene, whole)
-    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, holding, who)
+    return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, parted, who)
 
 
 def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int) -> Scene:
@@ -296,10 +322,13 @@ def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, bloc
     return carried_on(scene, sees & ~one, lead + block - 1).slice(lead)
 
 
-def held_on(known: Scene, body: Body, past: Corrected | None, who: tuple[int, ...]) -> Tensor:
-    """Which hands hold at the end of the last known frames: those that met there, or held before and have not parted.
+def parted_for(known: Scene, body: Body, past: Corrected | None, who: tuple[int, ...], block: int) -> Tensor:
+    """Frames since hands held, at the end of the last known ones, a block after the `past`. -> (B, Q, 2, 2)
 
-    So hands that a block does not bring together at once are brought nearer by the next. -> (B, Q, 2, 2) bool
+    Hands that held less than `REMEMBERED` ago hold on as soon as they are near enough for it, so those that a block
+    does not bring together are brought nearer by the next, and dancers who let go for a turn find each other again.
     """
-    before = past.holding if past is not None and past.who == who else None
-    return lasting_holds(body.joints(known), known.present, known.fps, before)[0][:, -1]
+    before = past.parted if past is not None and past.who == who else None
+    holding = None if before is None else before <= REMEMBERED
+    now = since_held(lasting_holds(body.joints(known), known.present, known.fps, holding)[0])
+    return now if before is None else torch.minimum(now, before + block)

@@ -14,6 +14,7 @@ from magnet.body import load_body
 from magnet.body.apart import Apart
 from magnet.body.contact import deepest
 from magnet.body.energy import CONTACT
+from magnet.body.holding import holds
 from magnet.body.joints import TOES
 from magnet.body.settle import DOFS
 from magnet.body.settle_wishes import FIRM
@@ -25,11 +26,11 @@ from magnet.generation.settling import (
     LOOSELY,
     PACE,
     REACH,
+    REMEMBERED,
     Corrected,
     around,
     carried_on,
-    hands_held,
-    held_on,
+    parted_for,
     settled_chunk,
     settled_on,
 )
@@ -140,7 +141,7 @@ def test_people_of_a_shipped_model_are_out_of_each_other() -> None:
 def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
     body = load_body()
     shake = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(56, 88)
-    assert bool(hands_held(shake, body).any())
+    assert bool(holds(body.joints(shake), shake.present)[0][:, -1].any())
     root = shake.T_world_root.clone()
     away = (root[:, :, 1, :3, 3] - root[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
     root[:, :, 1, :3, 3] += 0.25 * away / away.norm(dim=-1, keepdim=True)
@@ -156,8 +157,8 @@ def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
     assert together(settled_chunk(apart, nobody, "firm", past)[0]) < 3
 
 
-def test_hands_that_held_and_have_not_parted_hold_before_the_next_block() -> None:
-    body = load_body()
+def test_hands_that_held_hold_before_the_next_block_and_are_remembered_for_a_while() -> None:
+    body, who = load_body(), (0, 1)
     shake = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(56, 60)
     away = (shake.T_world_root[:, :, 1, :3, 3] - shake.T_world_root[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
 
@@ -166,12 +167,25 @@ def test_hands_that_held_and_have_not_parted_hold_before_the_next_block() -> Non
         root[:, :, 1, :3, 3] += metres * away / away.norm(dim=-1, keepdim=True)
         return shake.replace(T_world_root=root)
 
-    met = Corrected(torch.zeros(1, 2, 2, DOFS), hands_held(shake, body), (0, 1))
-    assert torch.equal(held_on(shake, body, None, (0, 1)), met.holding)
-    assert torch.equal(held_on(moved(0.3), body, met, (0, 1)), met.holding)
-    assert not held_on(moved(0.3), body, None, (0, 1)).any()  # nobody remembers that they met
-    assert not held_on(moved(0.3), body, met, (0, 2)).any()  # others met
-    assert not held_on(moved(0.8), body, met, (0, 1)).any()
+    def after(scene: Scene, parted: torch.Tensor | None, who: tuple[int, ...] = who) -> torch.Tensor:
+        past = None if parted is None else Corrected(torch.zeros(1, 2, 2, DOFS), parted, (0, 1))
+        return parted_for(scene, body, past, who, 4)
+
+    held = holds(body.joints(shake), shake.present)[0][:, -1]
+    met = after(shake, None)
+    assert held.any() and torch.equal(met == 0, held) and met[~held].isinf().all()
+    assert torch.equal(after(moved(0.3), met) == 0, held)  # they have not parted
+    assert after(moved(0.3), None).isinf().all()  # nobody remembers that they met
+    assert after(moved(0.3), met, (0, 2)).isinf().all()  # others met
+    parted = after(moved(0.8), met)
+    assert (parted[held] == 4).all()
+    for _ in range(REMEMBERED // 4 - 1):
+        parted = after(moved(0.8), parted)
+    assert (parted[held] == REMEMBERED).all()
+    assert torch.equal(after(moved(0.3), parted) == 0, held)  # near again soon enough
+    forgotten = after(moved(0.8), parted)
+    assert (forgotten[held] == REMEMBERED + 4).all()
+    assert (after(moved(0.3), forgotten) > REMEMBERED).all()
 
 
 def test_feet_shown_standing_stay_there_block_after_block() -> None:
@@ -187,7 +201,7 @@ def test_feet_shown_standing_stay_there_block_after_block() -> None:
         ahead = sliding.slice(start, start + 2 * block)
         made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
         shown.append(made.slice(0, block))
-        past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
+        past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
     toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (cat_time(shown), sliding))
     last = frames - 2 * block
     assert float((slid[last] - slid[0]).mean()) > 0.09
@@ -208,7 +222,7 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
         ahead = walking.slice(start, start + 2 * block)
         made, now = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past, plain)
         shown.append(made.slice(0, block))
-        past, plain = Corrected(now.offset[:, block - 2 : block], now.holding, now.who), ahead.slice(block - 2, block)
+        past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
     return cat_time(shown).replace(body=body.id)
 
 
