@@ -22,6 +22,9 @@ LOW = 0.05
 """Height in metres below which a toe can stand, as in the metric FS."""
 SLIDES = 0.6
 """Speed in m/s above which a low toe is stepping."""
+LAG = 0.15
+"""Metres that a foot which was shown standing may be from where the uncorrected body has it, seen from the pelvis; then
+it is let go, or who glides on over the floor would lean."""
 RAISED = 0.02
 """Metres that a heel may be raised and still stand: from there on CMU's heels move more than toes."""
 FLOATS = 0.03
@@ -98,7 +101,9 @@ class Wishes:
         stands = standing_feet(joints, rest, above, scene.fps, slides) & there[..., None]
         if before is not None:
             begin = torch.cat([before[0], joints[:, :1]], dim=1)
-            stays = standing_feet(begin, rest, above, scene.fps, slides)[:, 0]
+            behind = lagging(*(each[:, 0] for each in before))
+            stays = standing_feet(begin, rest, above, scene.fps, slides)[:, 0] & ~behind
+            stands = stands & ~behind[:, None]
             stood = torch.where(stays[..., None], before[1][:, 0, :, FEET][..., [0, 2]], torch.nan)
         on = low_toes(joints, above) & there[..., None]
         kept = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
@@ -142,6 +147,14 @@ def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) 
     low = low_toes(joints, above)
     speed = joints[..., TOES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
     return low[:, 1:] & low[:, :-1] & (speed < slides)
+
+
+def lagging(joints: Tensor, corrected: Tensor) -> Tensor:
+    """Joints of feet that stand too far from under the body, by `LAG`. (B, P, 22, 3) x 2 -> (B, P, 4) bool"""
+    off = (corrected - joints)[..., [0, 2]]
+    far = (off[..., FEET, :] - off[..., :1, :]).norm(dim=-1) > LAG
+    ankle, toe = far[..., : len(ANKLES)], far[..., len(ANKLES) :]
+    return (ankle | toe).repeat(1, 1, 2)
 
 
 def standing_feet(joints: Tensor, rest: Tensor, above: Tensor, fps: float, slides: float = SLIDES) -> Tensor:

@@ -41,12 +41,12 @@ SHOWN = Settle(
     stay=2.0,
     speed=1.0,
     bend=2500.0,
-    root=30.0,
+    root=60.0,
     lift=10.0,
-    stand=48.0,
-    hold=10.0,
+    stand=96.0,
+    hold=20.0,
     pull=0.1,
-    hard=20.0,
+    hard=40.0,
 )
 """How a causal plan's next frames are corrected: what is held over fades where nothing asks for it, but not at once.
 
@@ -55,7 +55,7 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = Settle(
-    iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, root=1.0, lift=10.0, stand=16.0, hold=2.0, hard=40.0
+    iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, root=0.3, lift=10.0, stand=16.0, hold=2.0, hard=40.0
 )
 """How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way, with a jerk if need
 be."""
