@@ -17,7 +17,7 @@ from magnet.body.energy import CONTACT
 from magnet.body.holding import holds
 from magnet.body.joints import TOES
 from magnet.body.settle import DOFS
-from magnet.body.settle_wishes import FIRM
+from magnet.body.settle_wishes import FIRM, LAG
 from magnet.generation import settling
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.rollout import generate
@@ -188,13 +188,12 @@ def test_hands_that_held_hold_before_the_next_block_and_are_remembered_for_a_whi
     assert (after(moved(0.3), forgotten) > REMEMBERED).all()
 
 
-def test_feet_shown_standing_stay_there_block_after_block() -> None:
-    """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
-    frames, block = 32, 4
+def glided(speed: float, frames: int, block: int = 4) -> tuple[Scene, Scene]:
+    """One who stands and whom the model moves on at so many m/s, as shown block by block, and as it was made."""
     still = standing(1, frames, 1, torch.device("cpu"))
     root = still.T_world_root.clone()
-    root[0, :, 0, 0, 3] += 0.15 * (torch.arange(frames) - block).clamp(min=0) / 30.0
-    sliding, body = still.replace(T_world_root=root), load_body()
+    root[0, :, 0, 0, 3] += speed * (torch.arange(frames) - block).clamp(min=0) / 30.0
+    sliding = still.replace(T_world_root=root)
     new, sees = torch.ones(2 * block, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
     shown, past, plain = [sliding.slice(0, block)], None, None
     for start in range(block, frames - block, block):
@@ -202,11 +201,27 @@ def test_feet_shown_standing_stay_there_block_after_block() -> None:
         made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
         shown.append(made.slice(0, block))
         past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
-    toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (cat_time(shown), sliding))
-    last = frames - 2 * block
+    return cat_time(shown), sliding
+
+
+def test_feet_shown_standing_stay_there_block_after_block() -> None:
+    """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
+    frames, body = 32, load_body()
+    toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in glided(0.15, frames))
+    last = frames - 8
     assert float((slid[last] - slid[0]).mean()) > 0.09
     assert float((toes[last] - toes[0]).abs().max()) < 0.03
     assert float(toes.diff(dim=0).abs().max()) < 0.005
+
+
+def test_feet_that_a_gliding_body_has_left_behind_are_let_go() -> None:
+    """While the model glides on at 0.4 m/s for half a metre with both feet down: nobody leans after them."""
+    body, frames = load_body(), 48
+    shown, sliding = (each.slice(0, frames - 8) for each in glided(0.4, frames))
+    feet = [body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (shown, sliding)]
+    lag = (feet[1] - feet[0]) - (sliding.T_world_root - shown.T_world_root)[0, :, 0, 0, 3, None]
+    assert float((feet[1][-1] - feet[1][0]).min()) > 0.4
+    assert 0.10 < float(lag.max()) < LAG + 0.08
 
 
 def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Scene:
