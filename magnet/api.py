@@ -96,7 +96,7 @@ def read(
 # -- scenes that show themselves ---------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Motion(Scene):
     """A scene with its body, which can show and save itself; usable wherever a `Scene` is."""
 
@@ -200,7 +200,7 @@ class NotebookView:
 # -- a model -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Model:
     """A trained model with its sampler.
 
@@ -217,6 +217,9 @@ class Model:
             if not isinstance(getattr(self, name), kind):
                 got = type(getattr(self, name)).__name__
                 raise ValueError(f"{name}: got {got}, expected {kind.__name__}; magnet.load() makes both")
+
+    def __repr__(self) -> str:
+        return f"Model of up to {self.most_people} people, sampled in {self.sampler.steps} steps"
 
     @property
     def most_people(self) -> int:

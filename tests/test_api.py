@@ -318,3 +318,10 @@ def test_a_careless_call_is_told_what_it_got_and_what_was_expected(
     with pytest.raises(ValueError, match=re.escape(message)):
         CARELESS[message](model, duet)
     assert not list(tmp_path.iterdir())
+
+
+def test_scenes_and_models_say_in_one_line_what_they_are() -> None:
+    scene = random_scene(2, 12, 3, torch.Generator().manual_seed(0))
+    assert repr(scene) == "Scene of 2 x 12 frames, 3 agents, 30 fps"
+    assert repr(magnet.Motion.of(scene)) == "Motion of 2 x 12 frames, 3 agents, 30 fps"
+    assert re.fullmatch(r"Model of up to \d+ people, sampled in \d+ steps", repr(magnet.load("duet")))

@@ -32,7 +32,9 @@ def add_body(options: Options) -> None:
 
 def add_origin(options: Options) -> None:
     """--in_unit, --up, --keep_floor and --joint, for files of other programs."""
-    options.add_argument("--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs)")
+    options.add_argument(
+        "--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs; of .npz m)"
+    )
     options.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point)")
     options.add_argument("--keep_floor", action="store_true", help="keep people at the height they were recorded at")
     theirs = "left_hip=Thigh_L, where names say nothing"

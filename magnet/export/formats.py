@@ -51,7 +51,7 @@ class Reading:
     Args:
         fps: resample to this rate; None: as recorded.
         trim: cut people of different lengths to the shortest.
-        unit: of a BVH's lengths; None: by the length of its legs.
+        unit: of lengths; None: of a BVH by the length of its legs, of an npz metres.
         up: axis of the file that points up; None: found.
         joints: for BVH: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
@@ -97,9 +97,7 @@ def read(
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
     scenes, notes, foreign = [], [], False
     for file in files:
-        if options.unit is not None:
-            raise ValueError(f"{file}: unit {options.unit!r} is for .bvh; lengths in a .npz are metres")
-        scene, note, strange = _read_npz(file, body, options.up)
+        scene, note, strange = _read_npz(file, body, options.up, options.unit)
         scenes.append(scene)
         notes += note
         foreign |= strange
@@ -128,11 +126,11 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
     metres = level(scene, body)
     if not metres:
         return []
-    where = "over" if metres > 0 else "under"
-    return [f"everybody stands {abs(metres):.2f} m {where} y = 0, where models have their floor; see --on_floor"]
+    where = f"{abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where models have their floor"
+    return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
 
 
-def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str], bool]:
+def _read_npz(path: Path, body: Body, up: str | None, unit: str | None = None) -> tuple[Scene, list[str], bool]:
     """A scene of ours or SMPL-X's keys, told apart by what they hold; notes; whether other programs wrote it."""
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
@@ -144,13 +142,17 @@ def _read_npz(path: Path, body: Body, up: str | None) -> tuple[Scene, list[str],
     if "meta" in keys and not {"poses", "root_orient"} & keys:
         if up not in (None, "y"):
             raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
+        if unit not in (None, "m"):
+            raise ValueError(
+                f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
+            )
         scene = Scene.load(path)
         if scene.body != body.id:
             raise ValueError(
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
             )
         return scene, [], False
-    scene, found = read_smplx(path, body, up)
+    scene, found = read_smplx(path, body, up, unit)
     note, ours = [], {"body", "surface_model_type"} <= keys
     if up is None and found not in ("y", "z"):
         note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")

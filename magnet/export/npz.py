@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.export.rig import UP
+from magnet.export.rig import UNITS, UP
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -75,7 +75,7 @@ def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
     return read_smplx(path, body, up)[0]
 
 
-def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Scene, str]:
+def read_smplx(path: str | Path, body: Body, up: str | None = None, unit: str | None = None) -> tuple[Scene, str]:
     """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several.
 
     Also read: AMASS's names (`trans`, `mocap_framerate`, `root_orient` and `pose_body`), more or fewer than ten betas
@@ -87,14 +87,18 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Sce
         body: whose shapes the scene will have.
         up: axis of the file that points up, one of `magnet.export.rig.UP`. None: y in files of ours, in others the
             axis along which pelvises stand.
+        unit: of the file's lengths, one of `magnet.export.rig.UNITS`; None: metres, refused where nobody is so high.
 
     Returns:
         The scene, B = 1, float32; and the axis of the file that points up.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no such file's keys or shapes, or another body's.
+        ValueError: no such file's keys or shapes, or another body's; no such unit, or another one than is said; turns
+            in degrees.
     """
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
     arrays, fps, written_for, name = _read(Path(path))
     if written_for is not None and written_for != body.id:
         raise ValueError(f"{path}: written for body {written_for!r}, but {body.id!r} was given")
@@ -110,13 +114,16 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Sce
     if written_for is None and body.id.startswith("open"):
         betas = torch.zeros_like(betas)
     rotations = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
-    pelvis = transl + body.rest_joints(betas.float())[:, 0].double()[:, None]
+    _require_radians(path, poses)
+    pelvis = transl * UNITS[unit or "m"] + body.rest_joints(betas.float())[:, 0].double()[:, None]
     T_world_root = rigid(rotations[:, :, 0], pelvis)
     if up is None:
         up = "y" if written_for is not None else _standing(T_world_root)
     if up not in UP:
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     T_world_root = T_world_root.new_tensor(np.block([[UP[up], np.zeros((3, 1))], [np.eye(4)[3:]]])) @ T_world_root
+    if unit is None:
+        _require_metres(path, T_world_root)
     scene = Scene(
         body_rot=rotations[:, :, 1:].transpose(0, 1)[None].float(),
         T_world_root=T_world_root.transpose(0, 1)[None].float(),
@@ -130,12 +137,34 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None) -> tuple[Sce
     return scene, up
 
 
+def _require_radians(path: str | Path, poses: Tensor) -> None:
+    """Refuse turns that nobody writes in radians, where half a turn is pi. poses (P, T, 66 or more)"""
+    turn = poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)).norm(dim=-1).nan_to_num()
+    if (turn > MOST_TURNED).any(dim=-1).float().mean() > 0.5:
+        raise ValueError(f"{path}: poses: turns of up to {float(turn.max()):.0f} radians; degrees? Divide by 180 / pi")
+
+
+def _require_metres(path: str | Path, T_world_root: Tensor) -> None:
+    """Refuse pelvises so high that their unit is another. (P, T, 4, 4) in the world"""
+    if not T_world_root.numel():
+        return
+    height = float(T_world_root[..., 1, 3].nan_to_num().median(dim=1).values.abs().max())
+    if height > HIGHEST:
+        raise ValueError(
+            f"{path}: pelvises are {height:.0f} m over or under the floor; say the unit of lengths: --in_unit cm or mm "
+            "(unit=...), or m if they are"
+        )
+
+
 def _standing(T_world_root: Tensor) -> str:
     """The axis of a file's world that points up, by where pelvises do. (P, T, 4, 4) -> a key of `UP`"""
     up = T_world_root[..., :3, 1].mean(dim=(0, 1))
     axis = int(up.abs().argmax())
     return "-" * bool(up[axis] < 0) + "xyz"[axis]
 
+
+HIGHEST, MOST_TURNED = 30.0, 9.0
+"""Metres of a pelvis over the floor, and radians of a turn, which files in metres and radians do not hold."""
 
 ALSO = {"transl": ("transl", "trans"), "mocap_frame_rate": ("mocap_frame_rate", "mocap_framerate", "fps")}
 """Our keys, and those that mean the same."""

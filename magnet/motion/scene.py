@@ -84,6 +84,9 @@ class Scene:
         if self.names and len(self.names) != B:
             raise ValueError(f"names: got {len(self.names)} for {B} scenes")
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} of {self.scenes} x {self.frames} frames, {self.agents} agents, {self.fps:g} fps"
+
     @property
     def scenes(self) -> int:
         return self.T_world_root.shape[0]

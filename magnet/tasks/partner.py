@@ -28,7 +28,8 @@ def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
             raise ValueError(f"target {agent}: the grid has agents 0 to {grid.agents - 1}")
         mask[agent] = True
     if not mask.any() or mask.all():
-        more = "; of one person who is given, `magnet predict --people 2` adds another" if grid.agents == 1 else ""
+        more = "; of one person who is given, `magnet predict --people 2` adds another, in Python inpaint(agent=1)"
+        more = more if grid.agents == 1 else ""
         raise ValueError(f"target {target}: name some of the {grid.agents} agents, not none and not all{more}")
     return mask
 

@@ -201,7 +201,10 @@ def test_another_programs_people_are_put_on_the_floor_and_ours_stay(duet: Scene,
         formats.read(upstairs(duet, tmp_path / "b.npz", body, ours=True)),
     ):
         assert torch.allclose(kept.scene.T_world_root[..., 1, 3], expected + 2, atol=1e-2)
-        assert any("m over y = 0, where models have their floor; see --on_floor" in note for note in kept.notes)
+        assert any(
+            "m over y = 0, where models have their floor; `magnet export --on_floor` puts" in note
+            for note in kept.notes
+        )
 
 
 def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, tmp_path: Path):

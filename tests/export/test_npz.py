@@ -9,11 +9,12 @@ import pytest
 import roma
 import torch
 
-from magnet.body import Body
+from magnet.body import Body, load_body
 from magnet.export import load_smplx, save_smplx
 from magnet.export.npz import read_smplx
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
 from magnet.testing import random_scene
 
 
@@ -153,3 +154,37 @@ def test_numbers_that_are_none_are_refused(trio: Scene, body: Body, tmp_path: Pa
         load_smplx(foreign(trio, body, tmp_path / "a.npz", ("transl",), transl=broken), body)
     with pytest.raises(FileNotFoundError, match="no such file"):
         load_smplx(tmp_path / "none.npz", body)
+
+
+def scaled(tmp_path: Path, metres: float = 1.0, radians: float = 1.0) -> Path:
+    """Somebody walking, as other programs write it, with lengths and turns times a factor."""
+    scene = synthesize("circle", 2, 120, torch.Generator().manual_seed(0), load_body()).scene.permute_agents(
+        torch.tensor([0])
+    )
+    arrays = dict(np.load(save_smplx(scene, tmp_path / "ours.npz", load_body())[0]))
+    path = tmp_path / "foreign.npz"
+    np.savez(
+        path,
+        poses=arrays["poses"] * radians,
+        trans=arrays["transl"] * metres,
+        mocap_framerate=np.array(30.0),
+        betas=arrays["betas"],
+    )
+    return path
+
+
+def test_lengths_in_centimetres_are_refused_until_they_are_called_so(tmp_path: Path) -> None:
+    path, body = scaled(tmp_path, metres=100.0), load_body()
+    with pytest.raises(ValueError, match=r"pelvises are \d+ m over or under the floor.*--in_unit cm"):
+        read_smplx(path, body)
+    read = read_smplx(path, body, unit="cm")[0]
+    plain = read_smplx(scaled(tmp_path), body)[0]
+    assert torch.allclose(read.T_world_root, plain.T_world_root, atol=1e-4)
+    assert float(read_smplx(scaled(tmp_path, metres=100.0), body, unit="m")[0].T_world_root[..., 1, 3].max()) > 30
+    with pytest.raises(ValueError, match="unit 'parsec': expected one of m, cm"):
+        read_smplx(path, body, unit="parsec")
+
+
+def test_turns_in_degrees_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"turns of up to .* radians; degrees"):
+        read_smplx(scaled(tmp_path, radians=180 / np.pi), load_body())
