@@ -182,6 +182,8 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     body = open_body_on(scene.device)
     there = scene.present.any(dim=0).nonzero()[:, 0]
     who, begun = tuple(there.tolist()), past is not None
+    if not who:
+        return scene, Corrected(scene.T_world_root.new_zeros(scene.scenes, 2, 0, DOFS), None, who)
     past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
     offset, parted = (None, None) if past is None else past[:2]

@@ -271,6 +271,14 @@ def test_what_is_left_deep_in_a_finished_chunk_is_corrected_more_loosely(monkeyp
     assert depth(less) > 0.08 and depth(less) > depth(made) + 0.015  # and so it takes the second
 
 
+def test_where_nobody_is_nothing_is_corrected() -> None:
+    scene = standing(1, 8, 2, torch.device("cpu"))
+    empty = scene.replace(present=torch.zeros(1, 2, dtype=torch.bool))
+    made, past = settled_chunk(empty, torch.zeros(8, 2, dtype=torch.bool), "hold", None)
+    assert torch.equal(made.T_world_root, empty.T_world_root) and past.who == ()
+    settled_chunk(scene, torch.zeros(8, 2, dtype=torch.bool), "hold", past)
+
+
 @pytest.mark.parametrize("speed", [1.7, 6.0])
 def test_who_is_made_through_another_is_led_past_in_the_first_correction(speed: float, monkeypatch) -> None:
     still, body = standing(1, 40, 2, torch.device("cpu")), load_body()
