@@ -201,7 +201,7 @@ def test_refine_refuses_what_means_nothing(
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--in_unit", "furlong"], "unit 'furlong' is for .bvh"),
+        (["--in_unit", "furlong"], "unit 'furlong' is for other programs' files"),
         (["--up", "q"], "up axis 'q' is for other programs' files"),
         (["--context", "-5"], "--context -5: expected 0 frames or more"),
         (["--context", "13"], "--context 13: got 12 frames, so at most 12 were given"),
