@@ -7,6 +7,7 @@ moves rigidly with its nearest ancestor among them, to whose skinning weights it
 from __future__ import annotations
 
 import contextlib
+import math
 import zipfile
 import zlib
 from functools import lru_cache
@@ -46,11 +47,12 @@ FROM_DEPTH = tuple(BY_DEPTH.index(j) for j in range(BODY_JOINTS))
 
 
 @lru_cache(maxsize=8)
-def _tree(device: torch.device) -> tuple[Tensor, tuple[tuple[Tensor, Tensor], ...], Tensor]:
-    """Indices of `bone_chain`: each joint's parent; of each depth, rotations and parents; from depths to joints."""
+def _tree(device: torch.device) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor]:
+    """Indices of `bone_chain`: each joint's parent; rotations by depth; each depth's parents; from depths to joints."""
     with torch.inference_mode(False):  # or training, later, could not use them
-        depths = [(torch.tensor(joints, device=device) - 1, torch.tensor(up, device=device)) for joints, up in DEPTHS]
-        return torch.tensor(PARENTS[1:], device=device), tuple(depths), torch.tensor(FROM_DEPTH, device=device)
+        by_depth = torch.tensor(BY_DEPTH[1:], device=device) - 1
+        ups = tuple(torch.tensor(up, device=device) for _, up in DEPTHS)
+        return torch.tensor(PARENTS[1:], device=device), by_depth, ups, torch.tensor(FROM_DEPTH, device=device)
 
 
 class Body(nn.Module):
@@ -157,21 +159,25 @@ class Body(nn.Module):
     def bone_chain(self, body_rot: Tensor, T_world_root: Tensor, rest_joints: Tensor) -> tuple[Tensor, Tensor]:
         """World rotations (..., 22, 3, 3) and positions (..., 22, 3), in one batched product per level of the tree."""
         body_rot, T_world_root = _wide(body_rot), _wide(T_world_root)
-        parents, depths, order = _tree(rest_joints.device)
+        parents, by_depth, ups, order = _tree(rest_joints.device)
         # By tensors that are kept: lists of indices would become tensors at every call, and once more for gradients.
         offset = (rest_joints[..., 1:, :] - rest_joints.index_select(-2, parents))[..., None]
         # NumPy's, because torch's imports SymPy: 34 MiB.
         lead = np.broadcast_shapes(body_rot.shape[:-3], T_world_root.shape[:-2], rest_joints.shape[:-2])
+        poses = math.prod(lead)
         step = torch.cat([body_rot.expand(*lead, -1, 3, 3), offset.expand(*lead, -1, 3, 1)], dim=-1)
+        # Joints first, so that each depth is one batch of small matrices.
+        steps = step.view(poses, len(by_depth), 12).index_select(1, by_depth).transpose(0, 1).reshape(-1, 3, 4)
         with _exact(body_rot):
-            level = T_world_root[..., None, :3, :].expand(*lead, 1, 3, 4)
+            level = T_world_root[..., :3, :].expand(*lead, 3, 4).reshape(1, poses, 3, 4)
             levels = [level]
-            for mine, parent in depths:
-                up = level.index_select(-3, parent)
-                level = up[..., :3] @ step.index_select(-3, mine)
-                level[..., 3] += up[..., 3]
+            for up, mine in zip(ups, steps.split([len(up) * poses for up in ups]), strict=True):
+                above = level.index_select(0, up).flatten(0, 1)
+                below = above[..., :3] @ mine
+                below[..., 3] += above[..., 3]
+                level = below.view(len(up), poses, 3, 4)
                 levels.append(level)
-            whole = torch.cat(levels, dim=-3).index_select(-3, order)
+            whole = torch.cat(levels).index_select(0, order).transpose(0, 1).view(*lead, len(order), 3, 4)
             return whole[..., :3], whole[..., 3]
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from magnet.body.capsules import CAPSULES, nearest_points
 from magnet.body.fitted_capsules import FOREARMS, HANDS, LEGS, PARTS, TRUNK, UPPER_ARMS
+from magnet.body.indices import indices
 
 from magnet.body.joints import (  # isort: skip
     ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
@@ -102,8 +103,8 @@ def excess(depth: Tensor, allowed: Tensor) -> Tensor:
 
 def hand_points(joints: Tensor, beyond: float = BEYOND) -> Tensor:
     """The middle of each hand, left and right. (..., 22, 3) -> (..., 2, 3) metres"""
-    wrist = joints[..., WRISTS, :]
-    return wrist + beyond * torch.nn.functional.normalize(wrist - joints[..., ELBOWS, :], dim=-1)
+    wrist, elbow = (joints.index_select(-2, indices(each, joints.device)) for each in (WRISTS, ELBOWS))
+    return wrist + beyond * torch.nn.functional.normalize(wrist - elbow, dim=-1)
 
 
 def hold_error(joints: Tensor, partner: Tensor, between: Tensor, held: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from magnet.body.base import Body
 from magnet.body.capsules import CAPSULES
+from magnet.body.indices import indices
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,
@@ -82,8 +83,8 @@ class FittedCapsules:
 
     def posed(self, R_world: Tensor, joints: Tensor) -> Tensor:
         """Ends in the world. Rotations (B, T, P, 22, 3, 3), joints (B, T, P, 22, 3) -> (B, T, P, K, 2, 3) metres"""
-        bones = list(self.bones)
-        R, t = R_world[..., bones, :, :], joints[..., bones, :]
+        bones = indices(self.bones, joints.device)
+        R, t = R_world.index_select(-3, bones), joints.index_select(-2, bones)
         return (R[..., None, :, :] @ self.ends[:, None, ..., None])[..., 0] + t[..., None, :]
 
 

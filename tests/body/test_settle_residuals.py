@@ -11,7 +11,8 @@ from magnet.body import load_body
 from magnet.body.energy import CONTACT, allowed_between_measured, allowed_within
 from magnet.body.fitted_capsules import fit_capsules, with_measured
 from magnet.body.holding import between_hands
-from magnet.body.settle_residuals import Residuals, Seen, all_residuals, hold_residuals, limits
+from magnet.body.settle_goals import Goals
+from magnet.body.settle_residuals import Residuals, Seen, all_residuals, limits, unmet
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -39,10 +40,8 @@ def asked(scene: Scene, free: Tensor, whose: bool = True) -> Residuals:
     """The residuals of people who are free; not `whose`: with everybody's wishes."""
     wishes = Wishes.of(scene, BODY, "hold")
     capsules = with_measured(fit_capsules(BODY, scene.betas), BODY.rest_joints(scene.betas[:, None]))
-    everybody = torch.ones_like(free)
-    return all_residuals(
-        seen(scene), capsules, wishes.of_those(free) if whose else wishes, free if whose else everybody
-    )
+    goals = Goals.of(wishes.of_those(free), free) if whose else Goals.of(wishes, torch.ones_like(free))
+    return all_residuals(seen(scene), capsules, goals, wishes.contact)
 
 
 def test_only_wishes_in_which_somebody_free_has_a_part_are_asked_for() -> None:
@@ -63,7 +62,10 @@ def pulls_of(scene: Scene, wishes: Wishes, held: Tensor, off: float) -> tuple[fl
     between = between_hands(seen(scene).by_frame, scene.present)[0]
     shall = replace(wishes, held=held, between=between - torch.tensor([0.6, 0.0, 0.8]) * off)
     pulls = []
-    for residuals in (hold_residuals(seen(scene), shall), hold_residuals(seen(scene), shall, 0.1)):
+    everybody = torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool)
+    for pull in (torch.inf, 0.1):
+        goals = Goals.of(shall, everybody, pull=pull)
+        residuals = unmet(seen(scene), goals).kept(slice(3 * goals.holds))
         force = (residuals.value * residuals.root_weight.square()).view(-1, 3)
         pulls.append(force.norm(dim=-1))
     return off, pulls[0], pulls[1]
@@ -81,8 +83,10 @@ def test_hands_far_off_pull_no_harder_than_from_the_distance_that_is_said() -> N
 
 def test_limits_that_are_kept_are_those_of_the_contact() -> None:
     for name, contact in CONTACT.items():
-        for kind, table in (("between", allowed_between_measured), ("within", allowed_within)):
-            allowed, i, j = limits(kind, contact, torch.device("cpu"))
-            assert torch.equal(allowed, table(contact)), name
-            assert torch.equal(torch.stack([i, j], dim=1), allowed.isfinite().nonzero())
-            assert not allowed.is_inference()
+        between, within = limits(contact, torch.device("cpu"))
+        own = allowed_within(contact)
+        assert torch.equal(between, allowed_between_measured(contact)), name
+        assert torch.equal(within[: len(own), : len(own)], own), name
+        assert within[len(own) :].isinf().all()
+        assert within[:, len(own) :].isinf().all()
+        assert not between.is_inference()

@@ -1,0 +1,19 @@
+"""Numbers of joints as tensors that are kept: lists would become tensors at every call."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from torch import Tensor
+
+
+@functools.cache
+def indices(numbers: tuple[int, ...], device: torch.device) -> Tensor:
+    """Whole numbers on a device. -> (N,) int
+
+    >>> indices((20, 21), torch.device("cpu"))
+    tensor([20, 21])
+    """
+    with torch.inference_mode(False):  # or training, later, could not use them
+        return torch.tensor(numbers, device=device)

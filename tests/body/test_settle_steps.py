@@ -1,0 +1,100 @@
+"""The steps of a correction: solved at once they are what conjugate gradients come to, scene by scene."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet.body.settle import DOFS
+from magnet.body.settle_residuals import Residuals
+from magnet.body.settle_steps import SOFT, TOGETHER, Settle, Smoothness, alike, exact_step, solve, stiffness
+
+T, P = 8, 2
+
+
+def problem(scenes: int, seed: int = 0) -> tuple[Residuals, Tensor, Tensor, Smoothness, Tensor]:
+    """Random residuals, from none to forty a scene, of two people of whom one may move in all but the first frames."""
+    draw = torch.Generator().manual_seed(seed)
+    count = torch.randint(0, 41, (scenes,), generator=draw)
+    scene = torch.arange(scenes).repeat_interleave(count)[torch.randperm(int(count.sum()), generator=draw)]
+    M = len(scene)
+    node, other = (scene * T * P + torch.randint(0, T * P, (M,), generator=draw) for _ in range(2))
+    point, along = torch.zeros(M, 3), torch.eye(3)[:1].expand(M, 3)
+    value, weight = torch.randn(M, generator=draw) * 0.05, torch.rand(M, generator=draw) * 5 + 0.1
+    one_sided = torch.rand(M, generator=draw) < 0.5
+    residuals = Residuals(node, node * 0, point, other, node * 0, point, along, value, weight, torch.ones(M), one_sided)
+    first, second = (torch.randn(M, DOFS, generator=draw) * weight[:, None] for _ in range(2))
+    free = torch.ones(scenes, T, P, dtype=torch.bool)
+    free[..., 1] = False
+    free[-1, :3] = False
+    past = torch.randn(scenes, 2, P, DOFS, generator=draw) * 0.1 * free[:, :2, :, None]
+    offset = torch.randn(scenes, T, P, DOFS, generator=draw) * 0.02 * free[..., None]
+    settle = Settle(stay=2.0, speed=1.0, bend=25.0, root=6.0, lift=10.0)
+    return residuals, first, second, Smoothness(settle, free, past, offset), offset
+
+
+@pytest.mark.parametrize("scenes", [1, 3, 2 * TOGETHER + 1])
+def test_a_step_solved_at_once_is_where_conjugate_gradients_end(scenes: int) -> None:
+    residuals, first, second, smooth, offset = problem(scenes)
+    exact = exact_step(residuals, first, second, smooth, offset)
+    slow = solve(residuals, first, second, smooth, offset, 4000)
+    assert float(slow.abs().max()) > 0.01
+    assert torch.allclose(exact, slow, atol=2e-5)
+    assert torch.equal(exact[:, :, 1], torch.zeros_like(exact[:, :, 1]))
+    assert torch.equal(exact[-1, :3], torch.zeros_like(exact[-1, :3]))
+
+
+def test_a_scene_s_step_does_not_depend_on_the_others() -> None:
+    residuals, first, second, smooth, offset = problem(5)
+    whole = exact_step(residuals, first, second, smooth, offset)
+    for number in range(5):
+        mine = residuals.node // (T * P) == number
+        shift = number * T * P
+        alone = residuals.kept(mine)
+        alone = alone._replace(node=alone.node - shift, other=alone.other - shift)
+        free = smooth.free[number : number + 1].diagonal(dim1=2, dim2=3).transpose(1, 2)
+        past = None if smooth.past is None else smooth.past[number : number + 1]
+        own = Smoothness(
+            Settle(stay=2.0, speed=1.0, bend=25.0, root=6.0, lift=10.0), free, past, offset[number : number + 1]
+        )
+        step = exact_step(alone, first[mine], second[mine], own, offset[number : number + 1])
+        assert torch.allclose(step[0], whole[number], atol=1e-5)
+
+
+def test_without_residuals_a_step_leads_where_corrections_cost_least() -> None:
+    residuals, first, second, smooth, offset = problem(2)
+    none = residuals.kept(slice(0))
+    for step in (
+        exact_step(none, first[:0], second[:0], smooth, offset),
+        solve(none, first[:0], second[:0], smooth, offset, 400),
+    ):
+        free = smooth.free.diagonal(dim1=2, dim2=3).transpose(1, 2)
+        assert (smooth.slope(offset + step)[free].abs() < 1e-3).all()
+
+
+def test_residuals_of_scenes_are_put_beside_those_of_scenes_that_have_about_as_many() -> None:
+    residuals = problem(2 * TOGETHER + 1)[0]
+    scene = residuals.node // (T * P)
+    groups = list(alike(scene, 2 * TOGETHER + 1))
+    rows = torch.cat([group.rows for group in groups if isinstance(group.rows, Tensor)])
+    assert torch.equal(rows.sort().values, torch.arange(len(scene)))
+    assert [group.size[0] for group in groups] == [TOGETHER, TOGETHER, 1]
+    assert groups[0].size[1] <= groups[1].size[1] <= groups[2].size[1]
+    number = torch.arange(len(scene), dtype=torch.float64)
+    for group in groups:
+        assert torch.equal(group.all_of(group.each(number)), number[group.rows])
+
+
+def test_one_sided_residuals_far_from_counting_do_not_pull() -> None:
+    residuals, first, second, smooth, offset = problem(1, seed=2)
+    far = residuals._replace(value=torch.full_like(residuals.value, -1.0), one_sided=residuals.one_sided | True)
+    none = exact_step(far.kept(slice(0)), first[:0], second[:0], smooth, offset)
+    assert SOFT < 1.0
+    assert torch.allclose(exact_step(far, first, second, smooth, offset), none, atol=1e-6)
+
+
+def test_the_cost_of_corrections_is_of_themselves_and_their_first_two_differences() -> None:
+    settle, x = Settle(stay=0.5, speed=2.0, bend=3.0), torch.randn(6, dtype=torch.float64)
+    cost = 0.5 * x.square().sum() + 2.0 * x.diff().square().sum() + 3.0 * x.diff(n=2).square().sum()
+    assert torch.allclose(x @ stiffness(settle, 6) @ x, cost)
