@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
 from magnet.body.drift import moved_over_ground, undrifted
+from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
 from magnet.body.jumps import unjumped
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
@@ -71,14 +72,15 @@ def repaired(
         settle: how poses are corrected.
         begun: the motion continues a past that stays, so corrections grow from 0.
         slides: m/s below which a low toe is meant to stand.
-        drifting: first stop people who slide over the ground as a whole (`undrifted`), or jump up or down (`unjumped`).
+        drifting: first bring down who is far from the floor all the time (`grounded`), and stop people who slide over
+            the ground as a whole (`undrifted`) or jump up or down (`unjumped`).
     """
     if scene.valid is not None and not bool(scene.valid.all()):
         each = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
         return _by_stretches(scene, fixed, begun, each)
     every = max(round(scene.fps / FPS), 1)
     if drifting:
-        scene = undrifted(unjumped(scene, body, fixed), body, fixed, slides)
+        scene = undrifted(unjumped(grounded(scene, body, fixed), body, fixed), body, fixed, slides)
     few = torch.arange(0, scene.frames, every, device=scene.device)
     seen = scene.frames_at(few).replace(fps=scene.fps / every)
     stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., few, :]
@@ -88,6 +90,26 @@ def repaired(
     if fixed is not None:
         offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
     return corrected(scene, offset)
+
+
+def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
+    """The scene with who is never near the floor, over or under it, moved to it as a whole.
+
+    Small steps of a correction would not come so far. Who is fixed in some frame, or near the floor in one, stays
+    bit-identical.
+    """
+    there = scene.present[:, None].expand(scene.T_world_root.shape[:3])
+    height = lowest(scene, body)
+    up = standing(height, there).nan_to_num(nan=0.0)  # (B, P)
+    most = JUMPED if scene.frames < JUMP else OFF
+    far = ((height > most).all(dim=1) | (height < -OFF).all(dim=1)) & scene.present
+    if fixed is not None:
+        far &= ~(fixed.to(far.device) if fixed.ndim == 1 else fixed.to(far.device).any(dim=-2))
+    if not bool(far.any()):
+        return scene
+    root = scene.T_world_root.clone()
+    root[..., 1, 3] -= torch.where(far, up, 0.0)[:, None].to(root)
+    return scene.with_poses(far[:, None], scene.body_rot, root)
 
 
 def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, each: Callable[..., Scene]) -> Scene:

@@ -272,6 +272,8 @@ def lengths(
     context = options.context if options.context is not None else 0 if nothing else min(CONTEXT, recorded)
     if options.inputs and not recorded:
         raise CommandError(f"the files hold {scene.frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
+    if 0 < context < TOKEN_FRAMES:
+        raise CommandError(f"--context {context}: a token is {TOKEN_FRAMES} frames; give as many or more, or 0")
     if context > recorded:
         raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
     rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE

@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         require_place(options.plot)
     got = scene_files.read_inputs(options, scene_files.reading(options))
     scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
-    formats.require_finite(got.scene)
+    formats.require_finite(got.scene, "cut such frames out")
     if not got.scene.frames or not bool(got.scene.present.any()):
         what = "people" if got.scene.frames else "frames"
         raise CommandError(f"{options.inputs[0]}: holds no {what}, so there is nothing to refine")

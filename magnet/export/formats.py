@@ -346,8 +346,11 @@ def files_of(path: Path, people: Sequence[int], smplx: bool = False) -> list[Pat
     return [file for place, count in zip(places, people, strict=True) for file in paths_of(place, count)]
 
 
-def require_finite(scene: Scene) -> None:
-    """Refuse NaN, which other programs cannot read; only our own scene files may hold it."""
+def require_finite(scene: Scene, instead: str = "cut such frames out, or write .npz") -> None:
+    """Refuse NaN, which other programs cannot read; only our own scene files may hold it.
+
+    instead: what the message says to do.
+    """
     shapes = (~scene.betas.isfinite().all(-1) & scene.present).nonzero().tolist()
     if shapes:
         raise ValueError(f"scene {shapes[0][0]}, agent {shapes[0][1]}: betas, the shape of the body, are not finite")
@@ -355,8 +358,8 @@ def require_finite(scene: Scene) -> None:
     bad = (~finite & scene.present[:, None]).nonzero().tolist()
     if bad:
         b, frame, agent = bad[0]
-        raise ValueError(f"scene {b}, agent {agent}: frame {frame} is not finite; cut such frames out, or write .npz")
+        raise ValueError(f"scene {b}, agent {agent}: frame {frame} is not finite; {instead}")
     try:
         require_rotations(scene.replace(valid=None), "a frame that is not valid")
     except ValueError as error:
-        raise ValueError(f"{error}; cut such frames out, or write .npz") from error
+        raise ValueError(f"{error}; {instead}") from error

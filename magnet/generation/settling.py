@@ -290,10 +290,15 @@ def settled_on(
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    parted = None if known is None or how != "hold" else parted_for(known, body, past, who, block)
+    parted = last = None
+    if known is not None:
+        joints = body.joints(known)
+        plain = joints
+        if uncorrected is not None:
+            plain = body.joints(uncorrected.replace(body=body.id).permute_agents(there))
+        last = plain[:, -1:], joints[:, -1:]
+        parted = parted_for(known, joints, past, who, block) if how == "hold" else None
     holding = None if parted is None else parted <= REMEMBERED
-    plain = known if uncorrected is None else uncorrected.replace(body=body.id).permute_agents(there)
-    last = None if known is None or plain is None else (body.joints(plain)[:, -1:], body.joints(known)[:, -1:])
     turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
     for number in turns[moving[turns]]:
         one = agents == number
@@ -324,13 +329,15 @@ def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, bloc
     return carried_on(scene, sees & ~one, lead + block - 1).slice(lead)
 
 
-def parted_for(known: Scene, body: Body, past: Corrected | None, who: tuple[int, ...], block: int) -> Tensor:
+def parted_for(known: Scene, joints: Tensor, past: Corrected | None, who: tuple[int, ...], block: int) -> Tensor:
     """Frames since hands held, at the end of the last known ones, a block after the `past`. -> (B, Q, 2, 2)
+
+    joints: those of `known`.
 
     Hands that held less than `REMEMBERED` ago hold on as soon as they are near enough for it, so those that a block
     does not bring together are brought nearer by the next, and dancers who let go for a turn find each other again.
     """
     before = past.parted if past is not None and past.who == who else None
     holding = None if before is None else before <= REMEMBERED
-    now = since_held(lasting_holds(body.joints(known), known.present, known.fps, holding)[0])
+    now = since_held(lasting_holds(joints, known.present, known.fps, holding)[0])
     return now if before is None else torch.minimum(now, before + block)

@@ -26,7 +26,7 @@ class AgenticSync:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
-            raise ValueError("agentic_sync continues a recording: give it context frames")
+            raise ValueError("agentic_sync continues a recording: give it context frames, 4 or more")
         unseen = ~torch.eye(grid.agents, dtype=torch.bool)
         return MaskSchedule.autoregressive(grid.past(), ~grid.past(), grid, self.block, unseen=unseen)
 
@@ -53,7 +53,7 @@ class AgenticAsync:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
-            raise ValueError("agentic_async continues a recording: give it context frames")
+            raise ValueError("agentic_async continues a recording: give it context frames, 4 or more")
         require_number("offset", self.offset, 0, 1)
         require_wholes("order", self.order)
         if len(set(self.order)) != len(self.order) or not set(self.order) <= set(range(grid.agents)):

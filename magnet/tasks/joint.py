@@ -16,7 +16,9 @@ class JointFuture:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
-            raise ValueError("joint_future continues a recording: give it context frames, or use the task generation")
+            raise ValueError(
+                "joint_future continues a recording: give it context frames, 4 or more, or use the task generation"
+            )
         return MaskSchedule.full_sequence(grid.past(), ~grid.past(), grid)
 
 

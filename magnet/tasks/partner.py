@@ -53,7 +53,9 @@ class PartnerInpainting:
         unknown = chosen(grid, self.target).expand(grid.tokens, -1)
         if self.own_past:
             if grid.context == 0:
-                raise ValueError("partner_inpainting with own_past goes on from a past: give it context frames")
+                raise ValueError(
+                    "partner_inpainting with own_past goes on from a past: give it context frames, 4 or more"
+                )
             unknown = unknown & ~grid.past()
         return MaskSchedule.full_sequence(~unknown, unknown, grid)
 
@@ -72,7 +74,7 @@ class PartnerPrediction:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
-            raise ValueError("partner_prediction continues a recording: give it context frames")
+            raise ValueError("partner_prediction continues a recording: give it context frames, 4 or more")
         return MaskSchedule.full_sequence(grid.past(), chosen(grid, self.target) & ~grid.past(), grid)
 
 
@@ -92,6 +94,6 @@ class MotionControl:
 
     def schedule(self, grid: Grid) -> MaskSchedule:
         if grid.context == 0:
-            raise ValueError("motion_control continues a recording: give it context frames")
+            raise ValueError("motion_control continues a recording: give it context frames, 4 or more")
         unknown = chosen(grid, self.target) & ~grid.past()
         return MaskSchedule.autoregressive(~unknown, unknown, grid, self.block, lookahead=False)

@@ -15,7 +15,7 @@ from magnet.body.drift import drift, undrifted
 from magnet.body.energy import hand_points
 from magnet.body.fit import clearance
 from magnet.body.joints import FEET, TOES
-from magnet.body.repair import repaired
+from magnet.body.repair import grounded, repaired
 from magnet.body.settle import DOFS, Settle, corrected, correction, jacobian
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
@@ -109,6 +109,26 @@ def test_whoever_floats_comes_down_and_whoever_jumps_does_not(handshake: Scene, 
     jump[:, 1] = (0.2 - 0.5 * 9.81 * time**2).clamp_min(0)
     made = repaired(moved(handshake, 1, jump), BODY, slides=0.0)
     assert float((made.T_world_root - moved(handshake, 1, jump).T_world_root)[0, 36:45, 1, 1, 3].abs().max()) < 0.03
+
+
+@pytest.mark.parametrize("height", [3.0, -2.5])
+def test_whoever_is_far_from_the_floor_all_the_time_is_moved_to_it(handshake: Scene, height: float) -> None:
+    """Also by more than the steps of a correction come to."""
+    scene = moved(handshake, 1, torch.tensor([0.0, height, 0.0]))
+    kept = torch.tensor([False, True])
+    assert torch.equal(grounded(scene, BODY, kept).T_world_root, scene.T_world_root)
+    assert torch.equal(grounded(handshake, BODY).T_world_root, handshake.T_world_root)
+    low = scene.slice(0, 40)
+    made = repaired(low, BODY)
+    assert torch.equal(grounded(scene, BODY).T_world_root[:, :, 0], scene.T_world_root[:, :, 0])
+    feet = BODY.joints(made)[0][..., FEET, 1].amin(dim=-1)
+    real = BODY.joints(handshake.slice(0, 40))[0][..., FEET, 1].amin(dim=-1)
+    assert float((feet - real).abs().max()) < 0.03
+
+
+def test_a_short_jump_is_not_taken_for_somebody_far_from_the_floor(handshake: Scene) -> None:
+    scene = moved(handshake, 1, torch.tensor([0.0, 0.5, 0.0])).slice(0, 12)
+    assert torch.equal(grounded(scene, BODY).T_world_root, scene.T_world_root)
 
 
 def test_whoever_slides_stands_and_holds_again(handshake: Scene) -> None:

@@ -114,6 +114,7 @@ def test_a_crowd_comes_from_nothing_as_far_apart_as_is_said(tmp_path, capsys) ->
             ("BVH", "say where to: --out FILE"),
             ("BVH --out a.obj", "nothing writes .obj"),
             ("BVH --out a.npz --context 400", "the files hold 48 frames"),
+            ("BVH --out a.npz --context 2", "a token is 4 frames; give as many or more, or 0"),
             ("BVH --out a.npz --people 1", "expected at least 2, as many as IN holds"),
             ("BVH --out a.npz --people 3", "joint_future reads motion of person 2, of whom no file tells"),
             ("BVH --out a.npz --sampler.stps 3", "no option --sampler.stps; did you mean --sampler.steps?"),
