@@ -61,10 +61,12 @@ class Hold(NamedTuple):
     other: int
 
 
-def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def lasting_holds(
+    joints: Tensor, present: Tensor, fps: float, before: Tensor | None = None, takes: float = HELD
+) -> tuple[Tensor, Tensor]:
     """Which hands hold, and the vectors that they shall have between them. -> as for `holds`
 
-    Hands that come within `HELD` hold for as long as they are within `PARTED`, short breaks apart, before and after;
+    Hands that come within `takes` hold for as long as they are within `PARTED`, short breaks apart, before and after;
     each hand one other. Where they are further apart than `GRIP` they are to come so near, eased at both ends.
 
     Args:
@@ -72,6 +74,7 @@ def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | 
         present: (B, P) bool.
         fps: frames a second.
         before: (B, Q, 2, 2) bool, hands that held in the frame before the first; None: there is none.
+        takes: metres.
     """
     between, both = between_hands(joints, present)
     apart = between.norm(dim=-1)
@@ -80,7 +83,7 @@ def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | 
     people = list(combinations(range(joints.shape[2]), 2))
     for b in range(len(apart)):
         busy = torch.zeros(joints.shape[2], 2, apart.shape[1], dtype=torch.bool, device=apart.device)
-        for hold in sorted(_found(apart[b], near[b], None if before is None else before[b], fps), reverse=True):
+        for hold in sorted(_found(apart[b], near[b], None if before is None else before[b], fps, takes), reverse=True):
             frames, (p, q) = slice(hold.start, hold.stop), people[hold.pair]
             free = ~busy[p, hold.one, frames] & ~busy[q, hold.other, frames]
             busy[p, hold.one, frames] |= free
@@ -91,14 +94,14 @@ def lasting_holds(joints: Tensor, present: Tensor, fps: float, before: Tensor | 
     return held, between * torch.lerp(torch.ones_like(shorter), shorter, share)[..., None]
 
 
-def _found(apart: Tensor, near: Tensor, before: Tensor | None, fps: float) -> list[Hold]:
+def _found(apart: Tensor, near: Tensor, before: Tensor | None, fps: float, takes: float) -> list[Hold]:
     """The holds of each two hands by themselves. apart, near (T, Q, 2, 2), before (Q, 2, 2)"""
     found = []
     for pair, one, other in near.any(dim=0).nonzero().tolist():
         metres = apart[:, pair, one, other]
         for start, stop in _bridged(true_runs(near[:, pair, one, other].tolist()), round(BREAK * fps)):
             held_on = start == 0 and before is not None and bool(before[pair, one, other])
-            if held_on or bool((metres[start:stop] < HELD).any()):
+            if held_on or bool((metres[start:stop] < takes).any()):
                 worth = float((PARTED - metres[start:stop]).clamp_min(0).sum())
                 found.append(Hold(worth, start, stop, pair, one, other))
     return found

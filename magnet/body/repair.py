@@ -179,13 +179,14 @@ def _settling(
 ) -> Tensor:
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
     toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
-    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last)
+    settle = settle or Settle()
+    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last, takes=settle.takes)
     first, second = torch.triu_indices(scene.agents, scene.agents, 1)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
     if how == "hold":
-        settle = replace(settle or Settle(), tilt=UPRIGHT)
+        settle = replace(settle, tilt=UPRIGHT)
     return correction(scene, body, wishes, fixed, settle, begun, past, toward)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from magnet.body.base import Body
 from magnet.body.fitted_capsules import fit_capsules, with_measured
 from magnet.body.indices import indices
-from magnet.body.joints import ANKLES, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
+from magnet.body.joints import ANKLES, COLLARS, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
 from magnet.body.settle_goals import Goals
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals
 from magnet.body.settle_steps import Settle, Smoothness, exact_step, solve
@@ -21,8 +21,8 @@ from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene
 
-MOVED: tuple[int, ...] = (0, SPINE2, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
-"""Joints that are turned; turning the pelvis turns the whole body."""
+MOVED: tuple[int, ...] = (0, SPINE2, *COLLARS, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
+"""Joints that are turned; turning the pelvis turns the whole body. `Smoothness` knows the places of the first four."""
 
 LIMBS = tuple(joint - 1 for joint in MOVED[1:])
 """Where their rotations are among those of the body."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magnet.body.holding import HELD
 from magnet.body.settle_residuals import Residuals
 
 FOLLOWS = 20.0
@@ -21,6 +22,9 @@ ROUNDS = 2
 
 TOGETHER = 8
 """Scenes whose steps are solved together."""
+
+STIFF = 1e9
+"""Cost that no correction pays."""
 
 SOFT = 0.005
 """Metres around 0 over which a one-sided residual comes to count: a hair's breadth must not decide about a step."""
@@ -42,9 +46,11 @@ class Settle:
         root: factor of these costs for moving the whole body.
         lift: further factor for moving it up or down: where hands are to meet, arms reach and feet stay on the floor.
         tilt: factor for turning the whole body or the back.
+        shrug: factor for turning the shoulder girdle; infinite: it stays.
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
         hold: factor for the cost of held hands that part.
+        takes: metres between hands that take hold, where hands that met go on holding.
         pull: metres that held hands may be off before they pull no harder: a hand far away shall not jerk the body.
         hard: factor for the cost of what must not be: depth between people, feet over the floor.
     """
@@ -57,9 +63,11 @@ class Settle:
     root: float = 3.0
     lift: float = 1.0
     tilt: float = 3.0
+    shrug: float = math.inf
     most: float = 0.15
     stand: float = 1.0
     hold: float = 1.0
+    takes: float = HELD
     pull: float = math.inf
     hard: float = 1.0
 
@@ -88,7 +96,7 @@ class Smoothness:
         self.past, self.lead = past, 0 if past is None else past.shape[1]
         self.start = torch.zeros_like(like)  # corrections that cost nothing
         self.scale = torch.ones(like.shape[-1], dtype=like.dtype, device=like.device)
-        self.scale[:3], self.scale[3:9] = settle.root, settle.tilt
+        self.scale[:3], self.scale[3:9], self.scale[9:15] = settle.root, settle.tilt, min(settle.shrug, STIFF)
         self.scale[1] *= settle.lift
         whole = stiffness(settle, self.lead + free.shape[1])
         self.cost = whole.to(like)[self.lead :]  # (T, L + T)

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from magnet.body.base import Body
 from magnet.body.energy import CONTACT, GRAVITY, Contact
 from magnet.body.fit import clearance
-from magnet.body.holding import holds, lasting_holds
+from magnet.body.holding import HELD, holds, lasting_holds
 from magnet.body.joints import ANKLES, FEET, TOES
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
@@ -74,6 +74,7 @@ class Wishes:
         begun: bool = False,
         holding: Tensor | None = None,
         before: tuple[Tensor, Tensor] | None = None,
+        takes: float = HELD,
     ) -> Wishes:
         """The wishes that a motion (B, T, P) itself shows.
 
@@ -85,6 +86,7 @@ class Wishes:
             holding: (B, Q, 2, 2) bool, hands that held in the frame before the first.
             before: joints (B, 1, P, 22, 3) of that frame, uncorrected and corrected; None: feet need not stay where
                 they were.
+            takes: metres between hands that take hold, with `hold`.
         """
         joints = body.joints(scene)
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
@@ -94,7 +96,7 @@ class Wishes:
         joints = joints.clone()
         joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
         if how == "hold":
-            held, between = lasting_holds(joints, scene.present, scene.fps, holding)
+            held, between = lasting_holds(joints, scene.present, scene.fps, holding, takes)
         else:
             held, between = holds(joints, scene.present)
         rest, stood = body.rest_joints(scene.betas), None

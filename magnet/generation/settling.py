@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -36,15 +37,18 @@ LOOSELY = (
 what is rounded otherwise in another batch moves people by a centimetre."""
 
 SHOWN = Settle(
-    iterations=4,
+    iterations=3,
     inner=16,
     stay=2.0,
     speed=1.0,
     bend=2500.0,
     root=60.0,
     lift=10.0,
+    shrug=5.0,
+    most=0.4,
     stand=96.0,
-    hold=20.0,
+    hold=30.0,
+    takes=0.3,
     pull=0.1,
     hard=40.0,
 )
@@ -54,9 +58,7 @@ Whole people are hardly moved, because who is moved four frames at a time change
 (docs/experiments_corrections.md).
 """
 
-PRESSED = Settle(
-    iterations=12, inner=40, stay=2.0, speed=1.0, bend=800.0, root=0.3, lift=10.0, stand=16.0, hold=2.0, hard=40.0
-)
+PRESSED = replace(SHOWN, iterations=6, inner=40, bend=800.0, root=0.3, stand=16.0, hold=2.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way, with a jerk if need
 be."""
 
@@ -339,5 +341,5 @@ def parted_for(known: Scene, joints: Tensor, past: Corrected | None, who: tuple[
     """
     before = past.parted if past is not None and past.who == who else None
     holding = None if before is None else before <= REMEMBERED
-    now = since_held(lasting_holds(joints, known.present, known.fps, holding)[0])
+    now = since_held(lasting_holds(joints, known.present, known.fps, holding, SHOWN.takes)[0])
     return now if before is None else torch.minimum(now, before + block)
