@@ -58,7 +58,7 @@ Whole people are hardly moved, because who is moved four frames at a time change
 (docs/experiments_corrections.md).
 """
 
-PRESSED = replace(SHOWN, iterations=6, inner=40, bend=800.0, root=0.3, stand=16.0, hold=2.0)
+PRESSED = replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=0.3, stand=16.0, hold=2.0)
 """How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way, with a jerk if need
 be."""
 

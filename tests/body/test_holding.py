@@ -129,3 +129,11 @@ def test_who_is_fixed_stays_and_the_other_reaches(parting: Scene) -> None:
     assert torch.equal(made.body_rot[:, :, 0], parting.body_rot[:, :, 0])
     assert torch.equal(made.T_world_root[:, :, 0], parting.T_world_root[:, :, 0])
     assert frames_together(made) > frames_together(parting) + 10
+
+
+def test_hands_take_hold_from_the_distance_that_is_said() -> None:
+    joints = two_people(near((10, 0.28)))
+    assert not lasting_holds(joints, THERE, FPS)[0].any()
+    held, between = lasting_holds(joints, THERE, FPS, takes=0.3)
+    assert held[0, :, 0, 0, 1].all()
+    assert float(between.norm(dim=-1)[0, 5, 0, 0, 1]) == pytest.approx(GRIP, abs=0.01)

@@ -169,7 +169,7 @@ def test_hands_that_held_hold_before_the_next_block_and_are_remembered_for_a_whi
 
     def after(scene: Scene, parted: torch.Tensor | None, who: tuple[int, ...] = who) -> torch.Tensor:
         past = None if parted is None else Corrected(torch.zeros(1, 2, 2, DOFS), parted, (0, 1))
-        return parted_for(scene, body, past, who, 4)
+        return parted_for(scene, body.joints(scene), past, who, 4)
 
     held = holds(body.joints(shake), shake.present)[0][:, -1]
     met = after(shake, None)
