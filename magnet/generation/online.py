@@ -50,7 +50,7 @@ class OnlineRollout(Rollout):
                 "live; train with pairwise_noise='noisier_end'"
             )
         self.base = 0  # the row that the recording, as far as it is held, begins with
-        # A correction doubles the time of an answer (docs/speed.md): it has to be asked for.
+        # With corrections an answer takes half as long again (docs/speed.md): they have to be asked for.
         options = (options or SamplerOptions()).filled(Sampling(settle="off"))
         super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
         self.there = past.frames // TOKEN_FRAMES

@@ -33,7 +33,7 @@ class Partner:
     """Some agents of a scene, who answer what the others do as it happens (the task `motion_control`, fed live).
 
     Answers are those that `motion_control` gives with the same seed and the same `settle` when all is known at once.
-    Poses are corrected only where `options` say so, because that takes twice as long. Memory does not grow.
+    Poses are corrected only where `options` say so, because that takes half as long again. Memory does not grow.
 
     Args:
         denoiser: a trained model.
