@@ -26,6 +26,9 @@ TOGETHER = 8
 STIFF = 1e9
 """Cost that no correction pays."""
 
+ROUNDED = 1e-5
+"""Share by which residuals count less: more than float32 rounds, or what is positive could come out as not."""
+
 SOFT = 0.005
 """Metres around 0 over which a one-sided residual comes to count: a hair's breadth must not decide about a step."""
 
@@ -289,6 +292,7 @@ def forces(
     ends = (slope / smooth.scale) @ slope.mT * linked
     ends = ends[:, :M] + ends[:, M:]
     gram = (ends[..., :M] + ends[..., M:]).double()
+    gram.diagonal(dim1=1, dim2=2).mul_(1 + ROUNDED)
     value, weight, free = group.each(residuals.value), group.each(residuals.root_weight), group.each(moves)
     one_sided, moved = group.each(residuals.one_sided), torch.zeros_like(free)
     eye, divisor = torch.eye(M, dtype=gram.dtype, device=gram.device), weight.clamp_min(1e-12)
