@@ -75,6 +75,8 @@ def repaired(
         drifting: first bring down who is far from the floor all the time (`grounded`), and stop people who slide over
             the ground as a whole (`undrifted`) or jump up or down (`unjumped`).
     """
+    if not scene.T_world_root.numel():
+        return scene
     if scene.valid is not None and not bool(scene.valid.all()):
         each = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
         return _by_stretches(scene, fixed, begun, each)
@@ -101,7 +103,7 @@ def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
     there = scene.present[:, None].expand(scene.T_world_root.shape[:3])
     height = lowest(scene, body)
     up = standing(height, there).nan_to_num(nan=0.0)  # (B, P)
-    most = JUMPED if scene.frames < JUMP else OFF
+    most = JUMPED if scene.frames < JUMP * max(scene.fps / FPS, 1.0) else OFF
     far = ((height > most).all(dim=1) | (height < -OFF).all(dim=1)) & scene.present
     if fixed is not None:
         far &= ~(fixed.to(far.device) if fixed.ndim == 1 else fixed.to(far.device).any(dim=-2))

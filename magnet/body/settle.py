@@ -6,6 +6,8 @@ fixed frames and people stay bit-identical.
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -39,29 +41,28 @@ LEAD = 2
 RAMP = 6
 """Frames after a fixed past over which weights grow to their full value."""
 
-SHORT = 24
-"""Frames up to which a step is solved at once, and not by conjugate gradients."""
+FEW = 32
+"""Poses of a scene that may move, up to which a step is solved at once, and not by conjugate gradients."""
 
 SMALL = 0.002
-"""Metres and radians of a step after which such a window is done with."""
+"""Metres and radians of a step after which such a scene is done with."""
 
 WINDOW, AHEAD = 240, 24
 """Frames that are corrected together, and frames after them that are computed and dropped."""
 
 
-def _ancestry() -> Tensor:
-    """Which bones each joint of `MOVED` moves. -> (M, 22) bool"""
-    moves = torch.zeros(len(MOVED), BODY_JOINTS, dtype=torch.bool)
+@functools.cache
+def _ancestry(device: torch.device) -> Tensor:
+    """Which joints of `MOVED` move each bone. -> (22, joints) bool"""
+    moves = [[False] * len(MOVED) for _ in range(BODY_JOINTS)]
     for bone in range(BODY_JOINTS):
         joint = bone
         while joint >= 0:
             if joint in MOVED:
-                moves[MOVED.index(joint), bone] = True
+                moves[bone][MOVED.index(joint)] = True
             joint = PARENTS[joint]
-    return moves
-
-
-ANCESTRY = _ancestry()
+    with torch.inference_mode(False):  # or training, later, could not use them
+        return torch.tensor(moves, device=device)
 
 
 def corrected(scene: Scene, offset: Tensor) -> Scene:
@@ -94,7 +95,7 @@ def jacobian(seen: Seen, node: Tensor, bone: Tensor, point: Tensor, along: Tenso
     R_world_parent = seen.R_world.index_select(1, indices(TURNED_IN, node.device))[node]
     own = (R_world_parent * turn[..., None]).sum(dim=-2)
     own[:, 0] = turn[:, 0]
-    own = own * ANCESTRY.to(own.device)[:, bone].T[..., None]
+    own = own * _ancestry(own.device)[bone][..., None]
     return torch.cat([along, own.flatten(1)], dim=-1)
 
 
@@ -174,7 +175,9 @@ def correct_window(
     offset = offset + smooth.start
     rest = body.rest_joints(scene.betas[:, None])
     capsules = with_measured(fit_capsules(body, scene.betas), rest)
-    done = torch.zeros(B, 1, 1, 1, dtype=torch.bool, device=offset.device)
+    few = (free.flatten(1).sum(dim=1) <= FEW)[:, None, None, None]  # scene by scene: no scene depends on the others
+    at_once, one_by_one = bool(few.any()), not bool(few.all())
+    done = torch.zeros_like(few)
     goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard)
     for _ in range(settle.iterations):
         R_world, joints = body.bone_chain(*moved(scene.body_rot, scene.T_world_root, offset), rest)
@@ -184,14 +187,16 @@ def correct_window(
             grown = ((residuals.node // P % T + 1) / RAMP).clamp(max=1.0)
             residuals = residuals._replace(root_weight=residuals.root_weight * grown)
         first, second = slopes(seen, residuals)
-        if T <= SHORT:
-            step = torch.where(done, 0.0, exact_step(residuals, first, second, smooth, offset))
-        else:
-            step = solve(residuals, first, second, smooth, offset, settle.inner)
+        step = solve(residuals, first, second, smooth, offset, settle.inner) if one_by_one else offset
+        if at_once:
+            mine = few.flatten()[residuals.node // (T * P)]
+            rows = residuals.kept(mine) if one_by_one else residuals
+            ends = (first[mine], second[mine]) if one_by_one else (first, second)
+            step = torch.where(few, exact_step(rows, *ends, smooth, offset), step)
+        step = torch.where(done, 0.0, step)
         size = step.abs().amax(dim=(1, 2, 3), keepdim=True)
         offset = offset + step * (settle.most / size.clamp_min(settle.most))
-        if T <= SHORT:
-            done = done | (size < SMALL)
-            if bool(done.all()):
-                break
+        done = done | (few & (size < SMALL))
+        if bool(done.all()):
+            break
     return offset

@@ -17,8 +17,6 @@ from magnet.body.settle_wishes import Wishes
 WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
 """Cost of a squared metre of each kind."""
 
-ONE_SIDED = ("between", "within", "floor", "float")
-
 HAND = 22
 """Number of a left hand among a body's points, behind those of its joints; the right hand is the next."""
 
@@ -54,7 +52,7 @@ class Goals:
         float_weight: square root of what it costs.
         both: (B, T, Q) bool, pairs of people who may be deep in each other.
         own: b, t, p of each free node.
-        between, within: cost of a squared metre of depth between people, and of a body in itself.
+        between: cost of a squared metre of depth between people.
     """
 
     rows: Rows
@@ -67,7 +65,6 @@ class Goals:
     both: Tensor
     own: tuple[Tensor, Tensor, Tensor]
     between: float
-    within: float = WEIGHTS["within"]
 
     @classmethod
     def of(
@@ -155,6 +152,6 @@ def rows_of(
     along = torch.eye(3, dtype=goal.dtype, device=goal.device)[list(axes)].repeat(len(goal), 1)
     flat = goal.flatten()
     weight = torch.full_like(flat, (WEIGHTS[kind] * factor) ** 0.5)
-    one_sided = torch.full_like(flat, kind in ONE_SIDED, dtype=torch.bool)
+    one_sided = torch.full_like(flat, kind == "floor", dtype=torch.bool)
     two = torch.full_like(flat, float(other is not None))
     return Rows(node, place, far, far_place, -along if down else along, flat, weight, two, one_sided)

@@ -14,7 +14,7 @@ from magnet.body.energy import Contact, allowed_between_measured, allowed_within
 from magnet.body.fitted_capsules import FittedCapsules
 from magnet.body.indices import indices
 from magnet.body.joints import FEET
-from magnet.body.settle_goals import BONES, Goals, pairs_of
+from magnet.body.settle_goals import BONES, WEIGHTS, Goals, pairs_of
 
 NEAR = 0.03
 """Metres short of counting at which capsules are kept: a step may make them count."""
@@ -149,7 +149,7 @@ def touching(seen: Seen, capsules: FittedCapsules, goals: Goals, contact: Contac
         pelvis = pelvis.flatten(0, 2)[node[m]] - pelvis.flatten(0, 2)[others[m]]
         axis = one[kept, 1] - one[kept, 0]
         away = torch.where(cross[:, None], off_axis(pelvis * pelvis.new_tensor([1.0, 0.0, 1.0]), axis), away)
-    cost = torch.where(m < count, goals.between**0.5, goals.within**0.5).to(depth)
+    cost = torch.where(m < count, goals.between**0.5, WEIGHTS["within"] ** 0.5).to(depth)
     always = torch.ones_like(depth)
     # The value is the depth; moving along `away` reduces it.
     return Residuals(node[m], bones[i], first, others[m], bones[j], second, -away, depth, cost, always, depth == depth)

@@ -26,9 +26,6 @@ TOGETHER = 8
 STIFF = 1e9
 """Cost that no correction pays."""
 
-ROUNDED = 1e-5
-"""Share by which residuals count less: more than float32 rounds, or what is positive could come out as not."""
-
 SOFT = 0.005
 """Metres around 0 over which a one-sided residual comes to count: a hair's breadth must not decide about a step."""
 
@@ -42,14 +39,14 @@ class Settle:
 
     Args:
         iterations: Gauss-Newton steps.
-        inner: conjugate gradient steps in each.
+        inner: conjugate gradient steps in each, where more poses of a scene may move than are solved at once.
         stay: cost of a squared metre or radian of correction.
         speed: cost of its squared change from frame to frame.
         bend: cost of its squared second difference.
         root: factor of these costs for moving the whole body.
         lift: further factor for moving it up or down: where hands are to meet, arms reach and feet stay on the floor.
         tilt: factor for turning the whole body or the back.
-        shrug: factor for turning the shoulder girdle; infinite: it stays.
+        shrug: factor for turning the shoulder girdle; infinite: it stays, to 1e-9 radians.
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
         hold: factor for the cost of held hands that part.
@@ -227,7 +224,7 @@ def exact_step(residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoo
 
     By Woodbury's identity: with C the cost of corrections, J the slopes and r the residuals, the step is d - C^-1 J' l,
     where d = -C^-1 (its slope so far) is the step without any residuals and l solves (1 + J C^-1 J') l = r + J d. For
-    short windows: J C^-1 J' of all residuals of a scene is formed.
+    few poses: J C^-1 J' of all residuals of a scene is formed.
 
     Arguments as for `solve`. -> (B, T, P, DOFS)
     """
@@ -289,10 +286,10 @@ def forces(
     slope = group.each(torch.stack([first, -second], dim=1)).transpose(1, 2).flatten(1, 2)
     linked = smooth.linked.flatten(0, 1)[node]  # (S, 2 M, T P)
     linked = linked.gather(2, (node % linked.shape[2])[:, None].expand(-1, 2 * M, -1))
+    slope = slope.double()  # what nearly cancels, as of a foot that stands, would round to what is not positive
     ends = (slope / smooth.scale) @ slope.mT * linked
     ends = ends[:, :M] + ends[:, M:]
-    gram = (ends[..., :M] + ends[..., M:]).double()
-    gram.diagonal(dim1=1, dim2=2).mul_(1 + ROUNDED)
+    gram = ends[..., :M] + ends[..., M:]
     value, weight, free = group.each(residuals.value), group.each(residuals.root_weight), group.each(moves)
     one_sided, moved = group.each(residuals.one_sided), torch.zeros_like(free)
     eye, divisor = torch.eye(M, dtype=gram.dtype, device=gram.device), weight.clamp_min(1e-12)

@@ -59,8 +59,8 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=0.3, stand=16.0, hold=2.0)
-"""How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way, with a jerk if need
-be."""
+"""How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way as a whole,
+smoothly, for a hand that jumps is seen more than some centimetres of depth."""
 
 REMEMBERED = 60
 """Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in

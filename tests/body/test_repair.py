@@ -129,6 +129,13 @@ def test_whoever_is_far_from_the_floor_all_the_time_is_moved_to_it(handshake: Sc
 def test_a_short_jump_is_not_taken_for_somebody_far_from_the_floor(handshake: Scene) -> None:
     scene = moved(handshake, 1, torch.tensor([0.0, 0.5, 0.0])).slice(0, 12)
     assert torch.equal(grounded(scene, BODY).T_world_root, scene.T_world_root)
+    fast = scene.frames_at(torch.arange(48) // 4).replace(fps=120.0)
+    assert torch.equal(grounded(fast, BODY).T_world_root, fast.T_world_root)
+
+
+def test_a_scene_of_nobody_or_of_no_frames_comes_back(handshake: Scene) -> None:
+    for scene in (handshake.slice(0, 0), handshake.permute_agents(torch.tensor([], dtype=torch.long))):
+        assert repaired(scene, BODY) is scene
 
 
 def test_whoever_slides_stands_and_holds_again(handshake: Scene) -> None:
