@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from magnet.body.energy import hand_points
+from magnet.body.indices import pairs_of
 from magnet.motion.resample import smoothstep
 from magnet.motion.runs import true_runs
 
@@ -31,8 +32,7 @@ def between_hands(joints: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     joints (B, T, P, 22, 3), present (B, P) -> (B, T, Q, 2, 2, 3) metres from the second's hands to the first's, (B, Q)
     bool; the Q pairs are in the order of `combinations`.
     """
-    pairs = list(combinations(range(joints.shape[2]), 2))
-    first, second = [i for i, _ in pairs], [j for _, j in pairs]
+    first, second = pairs_of(joints.shape[2], joints.device)
     hands = hand_points(joints)
     return hands[:, :, first, :, None] - hands[:, :, second, None], present[:, first] & present[:, second]
 

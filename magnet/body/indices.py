@@ -1,4 +1,4 @@
-"""Numbers of joints as tensors that are kept: lists would become tensors at every call."""
+"""Numbers of joints and pairs of people as tensors that are kept: lists would become tensors at every call."""
 
 from __future__ import annotations
 
@@ -17,3 +17,11 @@ def indices(numbers: tuple[int, ...], device: torch.device) -> Tensor:
     """
     with torch.inference_mode(False):  # or training, later, could not use them
         return torch.tensor(numbers, device=device)
+
+
+@functools.cache
+def pairs_of(people: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The people of each pair, in the order of `combinations`. -> (Q,) x 2"""
+    with torch.inference_mode(False):
+        first, second = torch.combinations(torch.arange(people, device=device)).unbind(dim=1)
+    return first, second

@@ -14,6 +14,7 @@ from magnet.body.apart import APART, Apart, kept_apart
 from magnet.body.base import Body
 from magnet.body.drift import moved_over_ground, undrifted
 from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
+from magnet.body.indices import pairs_of
 from magnet.body.jumps import unjumped
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
@@ -183,7 +184,7 @@ def _settling(
     toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
     settle = settle or Settle()
     wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last, takes=settle.takes)
-    first, second = torch.triu_indices(scene.agents, scene.agents, 1)
+    first, second = pairs_of(scene.agents, scene.device)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])

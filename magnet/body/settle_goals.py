@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magnet.body.indices import indices
+from magnet.body.indices import indices, pairs_of
 from magnet.body.joints import FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
 
@@ -117,14 +116,6 @@ class Goals:
             own=own,
             between=WEIGHTS["between"] * hard,
         )
-
-
-@functools.cache
-def pairs_of(people: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The people of each pair, in the order of `combinations`. -> (Q,) x 2"""
-    with torch.inference_mode(False):
-        first, second = torch.combinations(torch.arange(people, device=device)).unbind(dim=1)
-    return first, second
 
 
 def rows_of(

@@ -12,9 +12,9 @@ from torch import Tensor
 from magnet.body.capsules import nearest_points
 from magnet.body.energy import Contact, allowed_between_measured, allowed_within, hand_points
 from magnet.body.fitted_capsules import FittedCapsules
-from magnet.body.indices import indices
+from magnet.body.indices import indices, pairs_of
 from magnet.body.joints import FEET
-from magnet.body.settle_goals import BONES, WEIGHTS, Goals, pairs_of
+from magnet.body.settle_goals import BONES, WEIGHTS, Goals
 
 NEAR = 0.03
 """Metres short of counting at which capsules are kept: a step may make them count."""
@@ -102,7 +102,14 @@ def unmet(seen: Seen, goals: Goals) -> Residuals:
     over = lowest - goals.highest
     cost, alone = torch.full_like(over, goals.float_weight), torch.zeros_like(over)
     node = goals.float_node
-    return cat([own, Residuals(node, foot, sole, node, foot, sole, up, over, cost, alone, over == over)])
+    return cat(
+        [
+            own,
+            Residuals(
+                node, foot, sole, node, foot, sole, up, over, cost, alone, torch.ones_like(over, dtype=torch.bool)
+            ),
+        ]
+    )
 
 
 @functools.cache
@@ -152,7 +159,7 @@ def touching(seen: Seen, capsules: FittedCapsules, goals: Goals, contact: Contac
     cost = torch.where(m < count, goals.between**0.5, WEIGHTS["within"] ** 0.5).to(depth)
     always = torch.ones_like(depth)
     # The value is the depth; moving along `away` reduces it.
-    return Residuals(node[m], bones[i], first, others[m], bones[j], second, -away, depth, cost, always, depth == depth)
+    return Residuals(node[m], bones[i], first, others[m], bones[j], second, -away, depth, cost, always, always.bool())
 
 
 def meeting(one: Tensor, other: Tensor, radius: Tensor, other_radius: Tensor, allowed: Tensor) -> Tensor:

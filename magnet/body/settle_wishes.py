@@ -12,6 +12,7 @@ from magnet.body.base import Body
 from magnet.body.energy import CONTACT, GRAVITY, Contact
 from magnet.body.fit import clearance
 from magnet.body.holding import HELD, holds, lasting_holds
+from magnet.body.indices import pairs_of
 from magnet.body.joints import ANKLES, FEET, TOES
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
@@ -117,7 +118,7 @@ class Wishes:
 
     def of_those(self, free: Tensor) -> Wishes:
         """The wishes that somebody who is free has a part in. free (B, T, P) bool"""
-        first, second = torch.combinations(torch.arange(free.shape[2], device=free.device)).unbind(dim=1)
+        first, second = pairs_of(free.shape[2], free.device)
         either = (free[..., first] | free[..., second])[..., None, None]
         return replace(
             self,

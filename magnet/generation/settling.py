@@ -12,6 +12,7 @@ from torch.nn.functional import avg_pool1d, max_pool1d
 from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
 from magnet.body.holding import holds, lasting_holds
+from magnet.body.indices import pairs_of
 from magnet.body.repair import repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
 from magnet.generation.separation import Decode, open_body_on
@@ -247,7 +248,7 @@ def left_deep(scene: Scene, body: Body, allowed: Apart, fixed: Tensor) -> Tensor
     fixed (T, P) or (B, T, P) bool
     """
     joints = body.joints(scene)
-    first, second = torch.combinations(torch.arange(scene.agents, device=scene.device)).unbind(dim=1)
+    first, second = pairs_of(scene.agents, scene.device)
     free = ~(fixed[..., first] & fixed[..., second]).to(scene.device)
     both = (scene.present[:, first] & scene.present[:, second])[:, None] & free
     return ((excess_depth(joints[:, :, first], joints[:, :, second], allowed) > 0) & both).any(dim=2)
