@@ -28,7 +28,8 @@ def warmup_cosine(
     if options.muon:
         optimizer = MuonAdamW(parameters, lr, decay, options.muon)
     else:
-        optimizer = torch.optim.AdamW(parameters, lr, weight_decay=decay, fused=module.device.type == "cuda")
+        # Not fused: Lightning clips no gradients of a fused optimizer in mixed precision.
+        optimizer = torch.optim.AdamW(parameters, lr, weight_decay=decay)
     total, warmup = module.trainer.estimated_stepping_batches, options.warmup_steps
 
     def rate(step: int) -> float:

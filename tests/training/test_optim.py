@@ -9,6 +9,7 @@ import pytest
 import torch
 from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.plugins.precision import MixedPrecision
 from torch import nn
 
 from magnet.training.muon import MuonAdamW
@@ -16,10 +17,10 @@ from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions
 
 
-def in_training(steps: float, *callbacks: Callback) -> Any:
+def in_training(steps: float, *callbacks: Callback, device: str = "cpu") -> Any:
     """What `warmup_cosine` asks of a module in training."""
     trainer = SimpleNamespace(estimated_stepping_batches=steps, callbacks=list(callbacks), world_size=1)
-    return SimpleNamespace(device=torch.device("cpu"), trainer=trainer)
+    return SimpleNamespace(device=torch.device(device), trainer=trainer)
 
 
 @pytest.mark.parametrize(("muon", "kind"), [(0.0, torch.optim.AdamW), (3.0, MuonAdamW)])
@@ -39,6 +40,13 @@ def test_rates_rise_and_fall(muon: float, kind: type) -> None:
         assert each[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
         assert each[8] == pytest.approx(0.5)
         assert each[12] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("muon", [0.0, 3.0])
+def test_gradients_can_be_clipped_in_mixed_precision_on_a_gpu(muon: float) -> None:
+    """Lightning does not clip those of optimizers that scale by themselves, as fused ones do."""
+    made = warmup_cosine(in_training(12, device="cuda"), nn.Linear(2, 2).parameters(), OptimizerOptions(muon=muon))
+    MixedPrecision("bf16-mixed", "cuda").clip_gradients(made["optimizer"], 0.5)
 
 
 @pytest.mark.parametrize("steps", [1000, float("inf")])
