@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from magnet.body.floor import on_floor
+from magnet.denoiser.compiled import answered, records
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.rollout import stream
 from magnet.generation.stats import SamplingStats
@@ -176,33 +177,46 @@ def measure(
     task = registry.get(case.task)(**dict(case.options))
     context = 0 if case.task in FROM_NOTHING else CONTEXT
     scene = standing(case.batch, context + frames, case.people, model.device)
+    stats = SamplingStats()
+
+    def sampled() -> dict[str, float]:
+        nonlocal stats
+        stats, generator = SamplingStats(), torch.Generator(model.device).manual_seed(seed)
+        began = clock()
+        chunks = stream(model, scene, task, context, frames, 1, options, generator, stats=stats)
+        next(chunks)
+        first = clock() - began
+        for _ in chunks:
+            pass
+        return {"took": clock() - began, "first": first}
+
+    with watched(model, clock) as watch:
+        sampled()
+    products, operators = products_of(watch.again)
+    replays = options.compile and records(scene.T_world_root)
+    if replays:
+        sampled()  # records what the rounds replay; what is watched is not recorded
     timings: list[dict[str, float]] = []
-    for _ in range(rounds + 1):
-        stats = SamplingStats()
-        generator = torch.Generator(model.device).manual_seed(seed)
-        with watched(model, clock) as watch:
-            began = clock()
-            chunks = stream(model, scene, task, context, frames, 1, options, generator, stats=stats)
-            next(chunks)
-            first = clock() - began
-            for _ in chunks:
-                pass
-            took = clock() - began
-        if not timings:
-            products, operators = products_of(watch.again)
-        floor = median(seconds_of(products, model.device, clock) for _ in range(5))
-        evaluation = watch.seconds / max(watch.calls, 1)
-        timings.append({"took": took, "first": first, "evaluation": evaluation, "floor": floor})
-    counted = timings[1:]
+    for _ in range(rounds):
+        if replays:
+            timing = sampled()
+            with torch.no_grad():
+                timing["evaluation"] = seconds_of([watch.replayed], model.device, clock)
+        else:
+            with watched(model, clock) as watch:
+                timing = sampled()
+            timing["evaluation"] = watch.seconds / max(watch.calls, 1)
+        timing["floor"] = median(seconds_of(products, model.device, clock) for _ in range(5))
+        timings.append(timing)
 
     def middle(name: str) -> float:
-        return median(each[name] for each in counted)
+        return median(each[name] for each in timings)
 
     made = frames if context else frames + context
     return Speed(
         1000 * middle("evaluation"),
         1000 * middle("floor"),
-        median(each["evaluation"] / each["floor"] for each in counted),
+        median(each["evaluation"] / each["floor"] for each in timings),
         operators,
         stats.calls / made,
         stats.evaluations / made,
@@ -220,7 +234,7 @@ class Watch:
     """What the network was asked: how often, how long it took, and the last question."""
 
     def __init__(self, model: DenoiserCore, clock: Clock) -> None:
-        self.ask, self.clock = model.denoise, clock
+        self.model, self.ask, self.clock = model, model.denoise, clock
         self.calls, self.seconds = 0, 0.0
         self._last: tuple[Any, ...] = ()
 
@@ -238,6 +252,11 @@ class Watch:
     def again(self) -> Tensor:
         """The last question once more."""
         return self.ask(*self._last)
+
+    def replayed(self) -> Tensor | None:
+        """The last question once more, by a recording of it; None where such are not recorded."""
+        noisy, levels, present, cond, _ = self._last
+        return answered(self.model, noisy, levels, present, cond, compiled=True)
 
 
 @contextlib.contextmanager

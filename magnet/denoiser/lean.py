@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
-from magnet.denoiser.compiled import Compiled
+from magnet.denoiser.compiled import Compiled, records
 from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, rotation, sinusoids
 from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of, packs
 from magnet.precision import quick_bf16, quick_int8
@@ -177,7 +177,8 @@ class LeanTransformer:
         """As `Transformer.forward`; of tokens that are not `wanted` (N, P) bool, or absent, the output is zero.
 
         With a `memory`, what this was last asked with it must have been the same but for the token steps that change.
-        The blocks are `compiled` where they can be, and where keys and values of earlier blocks are not kept.
+        The blocks are `compiled` where they can be, and where keys and values of earlier blocks are not kept; on a GPU
+        never, where whole evaluations are recorded instead (`magnet.denoiser.compiled.answered`).
         """
         B, N, _, _ = noisy.shape
         begins, ends = self._span(N, wanted, memory)
@@ -288,7 +289,7 @@ class LeanTransformer:
         elif o.rope == "hidden":
             x = x + split_turned(x, turns(steps, people, o.width, x.device)[skipped:])
         x = x.to(self.dtype)
-        if compiled and (memory is None or not memory.steps):
+        if compiled and not records(x) and (memory is None or not memory.steps):
             made: Tensor = self._compiled(x, turn, sees, asked)
             return made
         for number, block in enumerate(self.blocks):

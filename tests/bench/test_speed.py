@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -37,6 +38,26 @@ def test_counts_are_those_of_the_plan(task: str) -> None:
     assert found.windows_per_frame >= found.evaluations_per_frame
     assert found.operators > 20 and found.evaluation_ms > 0 and found.floor_ms > 0
     assert "denoise" not in vars(model), "the model is left as it was"
+
+
+def test_recordings_are_timed_where_evaluations_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They were watched, and what is watched is not recorded: torch compiled the blocks for the GPU instead."""
+    asked: list[int] = []
+
+    def replayed(graphs: Any, run: Any, inputs: Any) -> torch.Tensor:
+        asked.append(len(inputs["noisy"]))
+        return run(**inputs)
+
+    for place in ("magnet.denoiser.compiled", "magnet.denoiser.lean", "magnet.bench.speed"):
+        monkeypatch.setattr(f"{place}.records", lambda tensor: True)
+    monkeypatch.setattr("magnet.denoiser.compiled.replayed", replayed)
+    monkeypatch.setattr(torch, "compile", lambda *_, **__: pytest.fail("torch compiles"))
+    model, rounds = tiny_denoiser(max_agents=2), 2
+    options = SamplerOptions(steps=2, compile=True)
+    found = speed.measure(model, speed.Case("joint_future", 2, 3), options, frames=16, rounds=rounds)
+    # One run that records and each round ask all, and one question more a round is timed by itself.
+    assert asked == [3] * round((rounds + 1) * 16 * found.evaluations_per_frame + rounds)
+    assert found.evaluation_ms > 0 and "denoise" not in vars(model)
 
 
 def test_cases_leave_out_what_one_alone_cannot_do() -> None:
