@@ -198,6 +198,7 @@ class Sampling:
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
         stabilization_beside: a higher such level for people beside somebody whose motion is given.
+        stabilization_unseen: such a level where agents do not see what is made of each other.
     """
 
     stride: int | None = None
@@ -209,6 +210,7 @@ class Sampling:
     stabilization_level: int | None = None
     stabilization_after: int = 0
     stabilization_beside: int | None = None
+    stabilization_unseen: int | None = None
 
     def __post_init__(self) -> None:
         SamplerOptions().filled(self)  # which refuses what no sampler takes

@@ -99,7 +99,7 @@ class WorldState:
         What is left is a view of what was, which goes when rows are added.
         """
         frames = rows * TOKEN_FRAMES
-        if self.options.guidance.stabilization_level:
+        if self.options.guidance.stabilization_level or self.options.guidance.stabilization_unseen:
             self.since = steps_since(self.known[:rows], self.since)
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows

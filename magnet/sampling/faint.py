@@ -8,6 +8,9 @@ from torch import Tensor
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.schedule import Stage
 
+AFTER_UNSEEN = 1
+"""Token steps after the last given one that are shown clean where `stabilization_unseen` counts."""
+
 
 def faint_levels(
     guidance: Guidance, known: Tensor, stage: Stage, since: Tensor | None = None, live: bool = False
@@ -25,6 +28,9 @@ def faint_levels(
     if guidance.stabilization_level:
         sure = shown_clean(known, guidance.stabilization_after, since)
         levels = torch.where(sure, 0, guidance.stabilization_level)
+    if guidance.stabilization_unseen and stage.decentralized:
+        lately = torch.where(shown_clean(known, AFTER_UNSEEN, since), 0, guidance.stabilization_unseen)
+        levels = lately if levels is None else torch.maximum(levels, lately)
     if guidance.stabilization_beside and not live:
         given = known[stage.start : stage.stop].all(dim=0)
         beside = (given.sum() > given.long()) & ~known

@@ -43,6 +43,9 @@ class Guidance:
             tasks that are not live (partner inpainting), and not in crowds: the given one tells more of where they are
             than a past that is a little wrong, and which keeps them wrong. None: as the model is best sampled where
             `stabilization_level` is open too, or 0.
+        stabilization_unseen: such a level where agents do not see what is made of each other (in step), from the second
+            token step that was made on: from a clean past alone each token goes on as the one before, a little slower,
+            and people come to a rest. The higher one counts. None: as `stabilization_beside`.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """
@@ -54,6 +57,7 @@ class Guidance:
     stabilization_level: int | None = None
     stabilization_after: int = 0
     stabilization_beside: int | None = None
+    stabilization_unseen: int | None = None
     cond_weight: float = 0.0
 
     def __post_init__(self) -> None:
@@ -61,7 +65,7 @@ class Guidance:
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
         require_number("cond_weight", self.cond_weight, least=0)
-        for name in ("stabilization_level", "stabilization_beside"):
+        for name in ("stabilization_level", "stabilization_beside", "stabilization_unseen"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 0, LEVELS - 1)
         require_whole("stabilization_after", self.stabilization_after, 0)

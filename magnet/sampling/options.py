@@ -169,8 +169,8 @@ class SamplerOptions:
         guidance, open_levels = self.guidance, []
         if guidance.stabilization_level is None:
             open_levels += ["stabilization_level", "stabilization_after"]
-            if guidance.stabilization_beside is None:
-                open_levels.append("stabilization_beside")
+            special = ("stabilization_beside", "stabilization_unseen")
+            open_levels += [name for name in special if getattr(guidance, name) is None]
         guidance = replace(guidance, **{name: getattr(best, name) for name in open_levels if hasattr(best, name)})
         named = {name: getattr(best, name) for name in left_open if hasattr(best, name)}
         return replace(self, guidance=guidance, **named)

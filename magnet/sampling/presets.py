@@ -36,6 +36,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "stabilization_level": 0,
             "stabilization_after": 0,
             "stabilization_beside": 0,
+            "stabilization_unseen": 0,
             "cond_weight": 0.0,  # the paper has no conditions
         },  # A.7: w = 1
         "noise_sampling": "joint",  # A.6.2

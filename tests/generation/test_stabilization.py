@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from magnet.generation.rollout import generate, stream
 from magnet.motion.scene import Scene, cat_time
-from magnet.sampling.faint import shown_clean, steps_since
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.faint import faint_levels, shown_clean, steps_since
+from magnet.sampling.grid import Grid
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
@@ -60,6 +64,41 @@ def test_beside_somebody_given_what_was_made_is_shown_faintly_but_not_live(model
     same = (clean.T_world_root == shaken.T_world_root).flatten(3).all(dim=-1)[0]
     assert bool(same[:, 1].all()), "who is given stays"
     assert bool(same[:12, 0].all()) and not bool(same[28:, 0].any())
+
+
+@pytest.mark.parametrize("name", registry.names())
+def test_who_does_not_see_the_others_sees_the_own_past_faintly(model, name) -> None:
+    """In step alone, from the third token on: the first sees what was given, the second one token that was made."""
+    start, task = random_scene(1, 64, 2, torch.Generator().manual_seed(4)), registry.get(name)()
+
+    def made(level: int | None) -> Scene:
+        guidance = Guidance(stabilization_unseen=level)
+        options = SamplerOptions(3, 4, pyramid_offset=0, turn=1, guidance=guidance, settle="off")
+        return generate(model, start, task, 8, 48, 1, options, torch.Generator().manual_seed(0))
+
+    clean, shaken = made(None), made(300)
+    same = (clean.T_world_root == shaken.T_world_root).flatten(3).all(dim=-1)[0].all(dim=-1)
+    if name != "agentic_sync":
+        assert bool(same.all())
+        return
+    assert bool(same[: 8 + TOKEN_FRAMES].all()), "what is decoded of the second depends on the third"
+    assert not bool(same[8 + 5 * TOKEN_FRAMES :].any())
+
+
+def test_of_two_levels_the_higher_one_counts() -> None:
+    """Five token steps, one given: that of long scenes begins later."""
+    known = torch.tensor([[True], [False], [False], [False], [False]]).expand(5, 2)
+    stage = registry.get("agentic_sync")().schedule(Grid(tokens=5, agents=2, context=1)).stages[-1]
+    guidance = Guidance(stabilization_level=450, stabilization_after=2, stabilization_unseen=100)
+
+    def shown(guidance: Guidance) -> list[int]:
+        levels = faint_levels(guidance, known, stage, live=True)
+        assert levels is not None
+        return levels[:, 0].tolist()
+
+    assert shown(guidance) == [0, 0, 100, 450, 450]
+    assert shown(replace(guidance, stabilization_level=50)) == [0, 0, 100, 100, 100]
+    assert shown(replace(guidance, stabilization_unseen=0)) == [0, 0, 0, 450, 450]
 
 
 @pytest.mark.parametrize("name", ["joint_future", "motion_control"])

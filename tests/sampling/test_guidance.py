@@ -202,6 +202,10 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
     clean = Guidance(stabilization_level=0)
     assert SamplerOptions(guidance=clean).filled(both).guidance == clean
     assert not SamplerOptions.preset("paper").filled(both).guidance.stabilization_beside
+    unseen = Sampling(stabilization_level=60, stabilization_unseen=90)
+    assert SamplerOptions().filled(unseen).guidance == Guidance(stabilization_level=60, stabilization_unseen=90)
+    assert SamplerOptions(guidance=clean).filled(unseen).guidance == clean
+    assert not SamplerOptions.preset("paper").filled(unseen).guidance.stabilization_unseen
 
 
 def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
