@@ -63,12 +63,18 @@ def products_of(run: Callable[[], Any]) -> tuple[list[Callable[[], Any]], int]:
 
 def seconds_of(runs: Iterable[Callable[[], Any]], device: torch.device, clock: Clock = time.perf_counter) -> float:
     """How long some functions take together, until the device is done."""
+    finished(device)
     began = clock()
     for run in runs:
         run()
+    finished(device)
+    return clock() - began
+
+
+def finished(device: torch.device) -> None:
+    """Wait until a GPU has done what it was asked."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return clock() - began
 
 
 CONTEXT = 32
@@ -182,20 +188,17 @@ def measure(
     def sampled() -> dict[str, float]:
         nonlocal stats
         stats, generator = SamplingStats(), torch.Generator(model.device).manual_seed(seed)
-        began = clock()
         chunks = stream(model, scene, task, context, frames, 1, options, generator, stats=stats)
-        next(chunks)
-        first = clock() - began
-        for _ in chunks:
-            pass
-        return {"took": clock() - began, "first": first}
+        return seconds_to_the_first_and_last(chunks, model.device, clock)
 
     with watched(model, clock) as watch:
         sampled()
-    products, operators = products_of(watch.again)
-    replays = options.compile and records(scene.T_world_root)
+    replays = options.compile and not options.guidance.smooth and records(scene.T_world_root)
     if replays:
         sampled()  # records what the rounds replay; what is watched is not recorded
+        with torch.no_grad():
+            replays = watch.replayed() is not None
+    products, operators = products_of(watch.recorded if replays else watch.again)
     timings: list[dict[str, float]] = []
     for _ in range(rounds):
         if replays:
@@ -226,6 +229,19 @@ def measure(
     )
 
 
+def seconds_to_the_first_and_last(chunks: Iterator[Any], device: torch.device, clock: Clock) -> dict[str, float]:
+    """How long it takes until the first frames are there, and until all are."""
+    finished(device)
+    began = clock()
+    next(chunks)
+    finished(device)
+    first = clock() - began
+    for _ in chunks:
+        pass
+    finished(device)
+    return {"took": clock() - began, "first": first}
+
+
 FROM_NOTHING = ("generation",)
 """Tasks that are given no context."""
 
@@ -243,8 +259,7 @@ class Watch:
         self._last = question
         began = self.clock()
         answer = self.ask(*question)
-        if answer.device.type == "cuda":
-            torch.cuda.synchronize(answer.device)
+        finished(answer.device)
         self.seconds += self.clock() - began
         self.calls += 1
         return answer
@@ -252,6 +267,10 @@ class Watch:
     def again(self) -> Tensor:
         """The last question once more."""
         return self.ask(*self._last)
+
+    def recorded(self) -> Tensor:
+        """The last question to the network as it was trained, which is what recordings hold."""
+        return self.ask(*self._last[:4])
 
     def replayed(self) -> Tensor | None:
         """The last question once more, by a recording of it; None where such are not recorded."""

@@ -198,7 +198,7 @@ class Sampling:
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
         stabilization_beside: a higher such level for people beside somebody whose motion is given.
-        stabilization_unseen: such a level where agents do not see what is made of each other.
+        stabilization_unseen: such a level in tasks whose agents act without seeing what others do next.
     """
 
     stride: int | None = None

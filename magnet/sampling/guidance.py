@@ -43,9 +43,10 @@ class Guidance:
             tasks that are not live (partner inpainting), and not in crowds: the given one tells more of where they are
             than a past that is a little wrong, and which keeps them wrong. None: as the model is best sampled where
             `stabilization_level` is open too, or 0.
-        stabilization_unseen: such a level where agents do not see what is made of each other (in step), from the second
-            token step that was made on: from a clean past alone each token goes on as the one before, a little slower,
-            and people come to a rest. The higher one counts. None: as `stabilization_beside`.
+        stabilization_unseen: such a level, for everybody, in tasks whose agents act without seeing what others do next
+            (in step), from the second token step that was made on: from a clean past alone each token goes on as the
+            one before, a little slower, and people come to a rest. The higher level counts. None: as
+            `stabilization_beside`.
         cond_weight: w of classifier-free guidance by a condition, such as a text (Ho and Salimans 2022): the prediction
             with the condition plus w times its difference to the one without. 0: the condition alone.
     """

@@ -14,7 +14,6 @@ from magnet.export.page.rig import Array
 from magnet.export.page.takes import ShownTake, take
 from magnet.generation.live import Live, LiveChunk
 from magnet.motion.scene import Scene
-from magnet.sampling.guidance import Guidance
 from magnet.tasks import registry
 from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
@@ -220,7 +219,9 @@ class LiveApp(ViewerBase):
             with self.live.lock:
                 settings.task = task.value
                 settings.steps = int(steps.value)
-                settings.guidance = Guidance(kind.value, float(weight.value), smooth=float(smooth.value))
+                settings.guidance = dataclasses.replace(
+                    settings.guidance, kind=kind.value, weight=float(weight.value), smooth=float(smooth.value)
+                )
                 settings.fields = {"offset": float(offset.value), "block": int(block.value)}
             self.refusal = ""
             self._rest()

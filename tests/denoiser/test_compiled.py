@@ -77,3 +77,7 @@ def test_compiled_blocks_give_the_same(precision: Precision, monkeypatch: pytest
             warnings.filterwarnings("error", "sampler.compile")  # what it says where it goes on without
             torch.testing.assert_close(packed(*asked, compiled=True), packed(*asked), rtol=1e-4, atol=1e-4)
     assert len(traced) == 1
+    monkeypatch.setattr(lean, "records", lambda tensor: True)  # a GPU, which records whole evaluations
+    again = LeanTransformer(made, precision)
+    torch.testing.assert_close(again(*asked, compiled=True), packed(*asked), rtol=1e-4, atol=1e-4)
+    assert len(traced) == 1

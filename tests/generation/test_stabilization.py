@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from magnet.generation.rollout import generate, stream
-from magnet.motion.scene import Scene, cat_time
+from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.faint import faint_levels, shown_clean, steps_since
 from magnet.sampling.grid import Grid
@@ -85,6 +85,20 @@ def test_who_does_not_see_the_others_sees_the_own_past_faintly(model, name) -> N
     assert not bool(same[8 + 5 * TOKEN_FRAMES :].any())
 
 
+def test_one_person_in_step_is_sampled_as_beside_a_couple(model) -> None:
+    """Nobody else is there to be unseen, but what is made of a scene must not depend on what else is in its batch."""
+    couple = random_scene(1, 40, 2, torch.Generator().manual_seed(4))
+    alone = couple.replace(present=torch.tensor([[True, False]]))
+    options = SamplerOptions(3, 4, guidance=Guidance(stabilization_unseen=300), settle="off")
+
+    def made(scene: Scene, *seeds: int) -> Scene:
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return generate(model, scene, registry.get("agentic_sync")(), 8, 32, 1, options, generators)
+
+    both, one = made(concatenate([couple, alone]), 1, 2).select([1]), made(alone, 2)
+    assert torch.allclose(both.T_world_root[:, :, 0], one.T_world_root[:, :, 0], atol=1e-4)
+
+
 def test_of_two_levels_the_higher_one_counts() -> None:
     """Five token steps, one given: that of long scenes begins later."""
     known = torch.tensor([[True], [False], [False], [False], [False]]).expand(5, 2)
@@ -101,11 +115,11 @@ def test_of_two_levels_the_higher_one_counts() -> None:
     assert shown(replace(guidance, stabilization_unseen=0)) == [0, 0, 0, 450, 450]
 
 
-@pytest.mark.parametrize("name", ["joint_future", "motion_control"])
+@pytest.mark.parametrize("name", ["joint_future", "motion_control", "agentic_sync"])
 def test_a_stream_knows_how_long_ago_somebody_was_given(model, name) -> None:
     """Rows that are let go hold what was given last; frames come as from one call."""
     start = random_scene(1, 80, 2, torch.Generator().manual_seed(4))
-    guidance = Guidance(stabilization_level=300, stabilization_after=5)
+    guidance = Guidance(stabilization_level=300, stabilization_after=5, stabilization_unseen=100)
     options = SamplerOptions(2, 2, pyramid_offset=0, guidance=guidance, settle="off")
     task = registry.get(name)()
     whole = generate(model, start, task, 8, 72, 1, options, torch.Generator().manual_seed(0))
