@@ -45,8 +45,13 @@ def test_rates_rise_and_fall(muon: float, kind: type) -> None:
 @pytest.mark.parametrize("muon", [0.0, 3.0])
 def test_gradients_can_be_clipped_in_mixed_precision_on_a_gpu(muon: float) -> None:
     """Lightning does not clip those of optimizers that scale by themselves, as fused ones do."""
-    made = warmup_cosine(in_training(12, device="cuda"), nn.Linear(2, 2).parameters(), OptimizerOptions(muon=muon))
+    weights = list(nn.Linear(2, 2).parameters())
+    made = warmup_cosine(in_training(12, device="cuda"), weights, OptimizerOptions(muon=muon))
+    for weight in weights:
+        weight.grad = torch.full_like(weight, 3.0)
     MixedPrecision("bf16-mixed", "cuda").clip_gradients(made["optimizer"], 0.5)
+    clipped = torch.cat([weight.grad.flatten() for weight in weights if weight.grad is not None])
+    assert len(clipped) == 6 and clipped.norm().item() == pytest.approx(0.5, rel=1e-4)
 
 
 @pytest.mark.parametrize("steps", [1000, float("inf")])
