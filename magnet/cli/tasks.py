@@ -216,6 +216,7 @@ class Shown:
         noise_sampling: `joint`: agents at a time step share their level; `independent`: each token has its own.
         moments: rows of the picture at most; denoising steps between them are left out.
         turn: token steps of a turn, where the task leaves it open; `duet` takes turns of 2.
+        opening: more denoising steps at the highest noise where nothing is known; `duet` takes 5.
     """
 
     out: Path | None = None
@@ -229,6 +230,7 @@ class Shown:
     noise_sampling: Literal["joint", "independent"] = "joint"
     moments: int = 16
     turn: int = 1
+    opening: int = 0
 
 
 def show_task(arguments: list[str]) -> int:
@@ -251,7 +253,7 @@ def show_task(arguments: list[str]) -> int:
     fields = read_fields(show_parser(kind), rest, (), f"magnet tasks show {name} --help")
     task, shown = kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
-    grid = Grid(*sizes, noise_sampling=shown.noise_sampling, turn=shown.turn)
+    grid = Grid(*sizes, noise_sampling=shown.noise_sampling, turn=shown.turn, opening=shown.opening)
     schedule = task.schedule(grid)
     formula = str(getattr(task, "formula", ""))
     if shown.out is not None:

@@ -12,8 +12,8 @@ from magnet.denoiser.options import NoiseOptions
 from magnet.sampling.noise import LEVELS, shifted
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
-MIXTURE = (0.2, 0.1, 0.05, 0.65)
-"""Shares of the four kinds in `mixture`."""
+MIXTURE = (0.2, 0.1, 0.65)
+"""How often `mixture` draws the first, second and last kind, beside each other; the third: `NoiseOptions.at_once`."""
 
 RAMPED = 0.6
 """Share of roll-outs in which each token is noisier than the one before it, as samplers roll by default; in the others
@@ -67,14 +67,15 @@ def draw_levels(
         levels = torch.randint(LEVELS + 1, shape, generator=generator, device=device)
         return shifted(levels, noise.shift).expand(B, N, P)
 
-    kind = noise.distribution
-    if kind == "per_token":
+    named = noise.distribution
+    if named == "per_token":
         return uniform(B, N, P)
-    if kind == "per_timestep":
+    if named == "per_timestep":
         return uniform(B, N, 1)
-    if kind == "per_sequence":
+    if named == "per_sequence":
         return uniform(B, 1, 1)
-    which = drawn_kinds(MIXTURE, (B, 1, 1), generator)
+    token, step, roll = (share * (1 - noise.at_once) / sum(MIXTURE) for share in MIXTURE)
+    which = drawn_kinds((token, step, noise.at_once, roll), (B, 1, 1), generator)
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
     rolled = rollout_levels(noise, B, N, P, generator, present)
@@ -111,7 +112,7 @@ def rollout_levels(
 
     In some scenes every agent is generated. In the others each agent draws a role (`ROLES`): generated, given up to
     the end of the block (motion control), given to the end (inpainting), or unknown from the block on (partner
-    prediction).
+    prediction). Of blocks at a shared level a share `to_end` reaches to the window's end, where strides fill it.
 
     In a share `faint_past` of the scenes the past of those who are generated or hidden is at one level up to `FAINT`,
     in half of these from a random token on: as samplers show what was made some seconds ago (`stabilization_level`).
@@ -129,6 +130,8 @@ def rollout_levels(
     nothing = torch.where(mixed, FROM_NOTHING_MIXED, noise.from_nothing)
     past = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < nothing, 0, past)
     stop = integers(past + 1, zero + N)
+    if noise.to_end:
+        stop = torch.where(torch.rand(B, 1, 1, generator=generator, device=device) < noise.to_end, N, stop)
     level = shifted(integers(zero + 1, zero + LEVELS), noise.shift)
     time = torch.arange(N, device=device)[None, :, None]
     ramped = torch.rand(B, 1, 1, generator=generator, device=device) < RAMPED

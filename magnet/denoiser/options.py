@@ -87,6 +87,10 @@ class NoiseOptions:
             others' given so far or hidden (ours); see `magnet.denoiser.levels.live_levels`.
         from_nothing: share of the roll-outs in `mixture` without any past, of those in which everybody is generated
             (ours).
+        to_end: share of the blocks at one level, in the roll-outs in `mixture`, that reach to the window's end, as
+            samplers fill it; then who is given as far as the block is given throughout. Others end anywhere (ours).
+        at_once: share of the scenes in `mixture` all of whose tokens are at one level, as scenes from nothing are
+            sampled (ours).
     """
 
     distribution: Distribution = "per_token"
@@ -96,13 +100,15 @@ class NoiseOptions:
     faint_past: float = 0.0
     live: float = 0.0
     from_nothing: float = 0.2
+    to_end: float = 0.0
+    at_once: float = 0.05
 
     def __post_init__(self) -> None:
         require_choice("distribution", self.distribution, Distribution)
         require_number("shift", self.shift, over=0)
         require_choice("pairwise", self.pairwise, PairwiseNoise)
         require_number("pairwise_metres", self.pairwise_metres, least=0)
-        for name in ("faint_past", "live", "from_nothing"):
+        for name in ("faint_past", "live", "from_nothing", "to_end", "at_once"):
             require_number(name, getattr(self, name), 0, 1)
 
 
@@ -192,6 +198,7 @@ class Sampling:
         stride: token steps finished before the window moves on.
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
         turn: token steps of a turn, where agents take turns and their task leaves it open.
+        opening: more denoising steps at the highest noise where nothing in a window is known.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
         noise_scale: standard deviation of the new noise in each denoising step.
@@ -204,6 +211,7 @@ class Sampling:
     stride: int | None = None
     pyramid_offset: int | None = None
     turn: int | None = None
+    opening: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
     noise_scale: float | None = None

@@ -29,6 +29,7 @@ class Grid:
     noise_sampling: NoiseSampling = SamplerOptions.noise_sampling  # see `magnet.sampling.plans.token_levels`
     spacing: Spacing = SamplerOptions.spacing  # of the levels that a token passes
     turn: int = 1  # token steps of a turn, where the task leaves it open
+    opening: int = 0  # more denoising steps where nothing is known, see `magnet.sampling.plans.opened`
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -39,6 +40,7 @@ class Grid:
             ("window", 1),
             ("stride", 1),
             ("turn", 1),
+            ("opening", 0),
         ):
             require_whole(name, getattr(self, name), least)
         if self.context > self.tokens:
@@ -96,4 +98,4 @@ def planning_grid(tokens: int, agents: int, past: int, window: int, options: Sam
     """The grid that a task plans on: sizes in token steps, and how these options sample."""
     o, stride = options, options.stride or min(STRIDE, window)
     levels = o.steps, window, stride, o.pyramid_offset, o.shift, o.noise_sampling, o.spacing
-    return Grid(tokens, agents, past, *levels, o.turn or 1)
+    return Grid(tokens, agents, past, *levels, o.turn or 1, o.opening or 0)

@@ -165,6 +165,25 @@ def nearest_levels(wanted: Tensor) -> Tensor:
     return torch.tensor(levels)
 
 
+OPENING = -4.6, -2.5
+"""Of an opening: `half_log_snr` of its first level after pure noise, 994, and where it ends at the latest, 947."""
+
+
+def opening_levels(first: int, count: int) -> Tensor:
+    """Levels of `count` more steps at the highest noise before a plan's first level, evenly spaced in `half_log_snr`.
+
+    Fewer where there are not so many. -> (at most count,) int, falling, all between K and `first`
+
+    >>> opening_levels(947, 5)
+    tensor([994, 990, 985, 977, 965])
+    """
+    highest, lowest = OPENING
+    to = min(max(float(half_log_snr(torch.tensor(first))), highest), lowest)
+    wanted = torch.linspace(highest, to, count + 1, dtype=torch.float64)[:-1]
+    levels = nearest_levels(wanted)[1:-1].unique().flip(0)
+    return levels[(levels < LEVELS) & (levels > first)]
+
+
 @dataclass
 class NoiseStream:
     """Noise of tokens in the order of time: that of token step i does not depend on how many are drawn at once.

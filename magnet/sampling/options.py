@@ -49,6 +49,9 @@ class SamplerOptions:
             to keyframes go in strides.
         turn: token steps of a turn, where agents take turns and their task leaves it open (`AgenticAsync.block`). None:
             as the model is best sampled, or 1.
+        opening: more denoising steps at the highest noise where nothing in a window is known: there it is decided what
+            people do and how far apart they are (ours). Not where a window is a pyramid of its own, and no more than
+            there are levels above the first step's. None: as the model is best sampled, or 0.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on take 3: deltas are far more
@@ -102,6 +105,7 @@ class SamplerOptions:
     stride: int | None = None
     pyramid_offset: int | None = None
     turn: int | None = None
+    opening: int | None = None
     placement: Placement = "fuse"
     pairwise_weight: float = 0.05
     apart: Separation = "off"
@@ -140,8 +144,9 @@ class SamplerOptions:
         for name in ("stride", "turn"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 1)
-        if self.pyramid_offset is not None:
-            require_whole("pyramid_offset", self.pyramid_offset, 0)
+        for name in ("pyramid_offset", "opening"):
+            if getattr(self, name) is not None:
+                require_whole(name, getattr(self, name), 0)
         require_number("pairwise_weight", self.pairwise_weight, least=0)
         require_whole("blend", self.blend, 0)
         require_number("crowd_enter", self.crowd_enter, over=0)

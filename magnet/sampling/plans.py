@@ -16,6 +16,7 @@ from magnet.sampling.noise import (
     ddim_levels,
     log_snr_levels,
     nearest_levels,
+    opening_levels,
     shifted,
 )
 from magnet.seeding import derive
@@ -65,6 +66,21 @@ def changing(levels: Tensor) -> Tensor:
     """The levels of a plan without denoising steps that change nothing. (S + 1, W, P) -> (at most as many, W, P)"""
     changes = (levels.diff(dim=0) != 0).flatten(1).any(dim=1)
     return torch.cat([levels[:1], levels[1:][changes]])
+
+
+def opened(levels: Tensor, count: int) -> Tensor:
+    """A stage's levels with an opening: `count` more steps at high noise, where nothing of its window is known.
+
+    What people do and how far apart they are is told by hundreds of noisy numbers together, so it is decided while each
+    of them seems to be noise alone: above the first level of a few steps, and a single step there ends in the mean of
+    all that could be. With a past, it is decided. (S + 1, W, P) -> (at most S + 1 + count, W, P)
+    """
+    if not count or bool((levels[0] < LEVELS).any()):
+        return levels
+    moves = levels[1] < LEVELS
+    more = opening_levels(int(levels[1][moves].max()), count)
+    between = torch.where(moves, more[:, None, None].to(levels), levels[0])
+    return torch.cat([levels[:1], between, levels[1:]])
 
 
 def blocks(target: Tensor, block: int) -> Iterator[tuple[int, int]]:

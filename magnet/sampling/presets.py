@@ -9,7 +9,7 @@ from typing import Any
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # The default before: it loses a quarter of the variance, and with it much of what the shipped model gets wrong.
-    "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even"},
+    "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even", "opening": 0},
     # What the model makes, and nothing corrected after it.
     "plain": {"settle": "off", "smooth_path": False},
     # Without rolling, for any model.
@@ -18,6 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "steps": 30,  # A.3
         "stride": 4,  # 4 of the window's 16 tokens are new, the other 12 are the overlap O of paper 3.3
         "pyramid_offset": 0,  # 3.3: segment by segment
+        "opening": 0,
         "turn": 1,  # 3.3: P(A_t | ...), then P(B_t | A_t, ...)
         "placement": "integrate",  # the paper predicts steps and integrates them
         "pairwise_weight": 0.05,  # not read by `integrate`

@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.checks import require_whole
 from magnet.sampling.grid import Grid
 from magnet.sampling.noise import LEVELS
-from magnet.sampling.plans import blocks, changing, initial_levels, levels_at, token_levels, window_positions
+from magnet.sampling.plans import blocks, changing, initial_levels, levels_at, opened, token_levels, window_positions
 
 __all__ = ["Grid", "MaskSchedule", "Stage", "initial_levels", "window_positions"]
 
@@ -219,6 +219,7 @@ class MaskSchedule:
             turn = torch.arange(grid.steps + slope * (last - first - 1) + 1)[:, None]
             turn = turn - slope * (torch.arange(start, stop) - first)
             levels = changing(torch.where(active, levels_at(plan, turn[..., None], start, stop), level[start:stop]))
+            levels = opened(levels, 0 if slope else grid.opening)
             stages.append(Stage(start, levels.short()))
             level[start:stop] = levels[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known)
@@ -241,7 +242,7 @@ class MaskSchedule:
         wanted = target.any(dim=1).nonzero()[:, 0].tolist()
         if wanted and wanted[0] < grid.window // 2:
             done = min(grid.window, grid.tokens)
-            levels = changing(torch.where(target[:done], plan[:, :done], level[:done]))
+            levels = opened(changing(torch.where(target[:done], plan[:, :done], level[:done])), grid.opening)
             stages.append(Stage(0, levels.short()))
             level[:done] = levels[-1]
         sliding = target & (torch.arange(grid.tokens) >= done)[:, None]

@@ -24,7 +24,7 @@ TASK_GRIDS = (
     Grid(20, 3, 4, steps=4, window=8, stride=3),
     Grid(16, 4, 8, steps=3),
     Grid(24, 1, 1, steps=2),
-    Grid(12, 2, 0, steps=3, window=8, stride=2),
+    Grid(12, 2, 0, steps=3, window=8, stride=2, opening=2),
     Grid(9, 3, 0, steps=1),
     Grid(20, 2, 4, steps=6, window=8, pyramid_offset=2),
     Grid(20, 2, 4, steps=6, window=8, pyramid_offset=None),

@@ -156,3 +156,24 @@ def test_so_many_scenes_begin_from_nothing_as_are_asked_for(share, generator):
     alone, mixed = (each + (1 - each) / 16 for each in (share, FROM_NOTHING_MIXED))
     both = 1 - ROLES[1] - ROLES[2]
     assert nothing == pytest.approx((1 - MIXED) * alone + MIXED * both * mixed, abs=0.02)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_so_many_blocks_fill_the_window_as_are_asked_for(share, generator):
+    """Of those at one level, of scenes in which everybody is generated; the others end anywhere."""
+    levels = rollout_levels(NoiseOptions("mixture", from_nothing=1.0, to_end=share), 40_000, 16, 2, generator)
+    active = (levels > 0) & (levels < LEVELS)
+    alike = (levels[:, :, 0] == levels[:, :, 1]).all(dim=1) & active[:, 0].all(dim=1)
+    stop = active.all(dim=2).sum(dim=1)
+    level = levels[:, 0, 0]
+    in_block = torch.arange(16) < stop[:, None]
+    flat = alike & ((levels[:, :, 0] == level[:, None]) | ~in_block).all(dim=1) & (stop > 1)
+    whole = float((stop[flat] == 16).double().mean())
+    assert whole == pytest.approx(share + (1 - share) / 15, abs=0.05)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_so_many_scenes_are_at_one_level_as_are_asked_for(share, generator):
+    levels = draw_levels(NoiseOptions("mixture", at_once=share, from_nothing=0.0), 20_000, 16, 2, generator)
+    one = (levels == levels[:, :1, :1]).flatten(1).all(dim=1)
+    assert float(one.double().mean()) == pytest.approx(share, abs=0.02)

@@ -3,7 +3,17 @@ import math
 import pytest
 import torch
 
-from magnet.sampling.noise import LEVELS, NoiseStream, add_noise, alpha_bar, ddim_levels, ddim_step, shifted
+from magnet.sampling.noise import (
+    LEVELS,
+    NoiseStream,
+    add_noise,
+    alpha_bar,
+    ddim_levels,
+    ddim_step,
+    half_log_snr,
+    opening_levels,
+    shifted,
+)
 
 
 def test_level_zero_is_clean_and_the_last_level_pure_noise_bit_for_bit(generator):
@@ -155,3 +165,12 @@ def test_a_scale_is_that_of_new_noise_alone():
 def test_eta_is_a_share():
     with pytest.raises(ValueError, match="eta: got 2, expected 0"):
         NoiseStream((1, 1, 1), eta=2.0)
+
+
+@pytest.mark.parametrize("first", [0, 1, 70, 634, 947, 990, 998, 999])
+def test_an_opening_is_at_high_noise_in_steps_of_one_length(first):
+    levels = opening_levels(first, 6)
+    assert len(levels) <= 6 and (levels > first).all() and (levels < LEVELS).all() and (levels.diff() < 0).all()
+    if first < 950:
+        steps = half_log_snr(levels).diff()
+        assert len(levels) == 6 and levels.min() > 950 and steps.max() < 1.6 * steps.min()

@@ -268,3 +268,36 @@ def test_a_grid_of_nothing_names_the_size(size):
 def test_more_context_than_there_is_is_refused():
     with pytest.raises(ValueError, match="context: got 5 token steps, expected at most the 4 there are"):
         Grid(4, 2, 5)
+
+
+@pytest.mark.parametrize("rolls", [True, False])
+@pytest.mark.parametrize("steps", [1, 4, 16])
+def test_an_opening_is_more_steps_at_high_noise_where_nothing_is_known(steps, rolls):
+    """The first window alone is denoised in more steps, and otherwise in the same."""
+    grid = Grid(tokens=30, agents=2, context=0, steps=steps, spacing="log_snr", pyramid_offset=None if rolls else 0)
+    plain, opened = joint(grid), joint(replace(grid, opening=5))
+    assert opened.evaluations == plain.evaluations + 5
+    (first, *rest), (before, *others) = opened.stages, plain.stages
+    assert all(one.same_but_start(other) for one, other in zip(rest, others, strict=True))
+    assert torch.equal(first.levels[[0, *range(6, steps + 6)]], before.levels)
+    new = first.levels[1:6]
+    assert (new == new[:, :1, :1]).all() and (first.levels.diff(dim=0) < 0).all()
+    assert new.min() > 950 and new.max() < LEVELS
+
+
+@pytest.mark.parametrize("rolls", [True, False])
+@pytest.mark.parametrize(("name", "context"), [("joint_future", 1), ("partner_inpainting", 0), ("inbetweening", 4)])
+def test_with_something_known_there_is_no_opening(name, context, rolls):
+    grid = Grid(tokens=30, agents=2, context=context, steps=4, pyramid_offset=None if rolls else 0)
+    plain, opened = (registry.get(name)().schedule(replace(grid, opening=opening)) for opening in (0, 5))
+    assert opened.evaluations == plain.evaluations
+
+
+def test_a_window_that_is_a_pyramid_of_its_own_has_no_opening():
+    grid = Grid(tokens=30, agents=2, context=0, steps=16, pyramid_offset=1)
+    assert joint(replace(grid, opening=5)).evaluations == joint(grid).evaluations
+
+
+def test_an_opening_has_no_more_steps_than_there_are_levels():
+    grid = Grid(tokens=8, agents=1, context=0, steps=999, spacing="even", pyramid_offset=0)
+    assert joint(replace(grid, opening=5)).evaluations == 999
