@@ -84,6 +84,7 @@ def bars() -> list[Bar]:
         deepest = 0.0 if run == joint else 0.002
         listed.append(Bar(run, "frames over 10 cm deep", of("depth_over_10cm"), fixed(deepest)))
         listed.append(Bar(run, "frames in which somebody floats", of("floating"), fixed(0.0)))
+        listed.append(Bar(run, "frames in which somebody is down", of("down"), fixed(0.0)))
     return listed
 
 

@@ -13,7 +13,7 @@ from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.body_depth import BodyDepth
 from magnet.metrics.columns import Better, Column, column, columns_of
 from magnet.metrics.diversity import Diversity, diversity
-from magnet.metrics.floor import Floating, GroundPenetration, lowest_foot
+from magnet.metrics.floor import Down, Floating, GroundPenetration, lowest_foot
 from magnet.metrics.frechet import FrechetBySecond, FrechetDistance, frechet_distance
 from magnet.metrics.futures import Futures
 from magnet.metrics.hand_contact import HandContact
@@ -35,6 +35,7 @@ __all__ = [
     "ClipMeans",
     "Column",
     "Diversity",
+    "Down",
     "Floating",
     "FootSkating",
     "FrechetBySecond",
@@ -130,6 +131,7 @@ def _of_motion(fps: float, of: Of, scored: Tensor | None, confidence: float | No
         "hands": HandContact(**means),
         "distance": PartnerDistance(of=of, agents=scored),
         "floating": Floating(**means),
+        "down": Down(**means),
         "ground": GroundPenetration(**means),
         "toes": StandingToes(**means),
         "jitter": Jitter(**means),

@@ -1,4 +1,4 @@
-"""Contact of feet with the floor: floating above it, and penetration."""
+"""People and the floor: feet that float above it or are in it, and who is down on it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from magnet.body.joints import FEET
+from magnet.body.joints import FEET, PELVIS
 from magnet.metrics.base import ClipMeans, clip_sums
 from magnet.metrics.columns import Column
 from magnet.metrics.futures import Futures
@@ -46,6 +46,34 @@ class Floating(ClipMeans):
         height = lowest_foot(futures.generated)  # (S, B, T, P)
         floats = height > self.above
         return [clip_sums(floats.double(), futures.scored), clip_sums(height, floats & futures.scored)]
+
+
+class Down(ClipMeans):
+    """`down`: share of a person's frames with the pelvis under `below` metres: who sits, kneels, lies, does the splits.
+
+    Dancers lunge and dip their partners with the pelvis higher; read it beside the recording's. Averages of joints hide
+    one sample in twenty that ends on the floor.
+
+    >>> import torch
+    >>> from magnet.testing import standing_people
+    >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
+    >>> metric = Down()
+    >>> metric.update((truth - torch.tensor([0.0, 0.5, 0.0]))[None], truth)
+    >>> round(metric.compute()["down"].item(), 3)
+    1.0
+    """
+
+    columns: ClassVar[Mapping[str, Column]] = {
+        "down": Column("down", "", "real", "share of frames with the pelvis under 60 cm"),
+    }
+
+    def __init__(self, below: float = 0.6, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.below = below
+
+    def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        down = futures.generated[..., PELVIS, 1] < self.below  # (S, B, T, P)
+        return [clip_sums(down.double(), futures.scored)]
 
 
 class GroundPenetration(ClipMeans):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.metrics import Floating, GroundPenetration, StandingToes
+from magnet.metrics import Down, Floating, GroundPenetration, StandingToes
 
 from .batches import WHO, Choose, draw_batch, result, scored
 
@@ -43,6 +43,19 @@ def test_feet_on_the_floor_are_neither_above_it_nor_in_it() -> None:
     assert result(Floating(), *batch) == pytest.approx({"floating": 0.25, "floating_height": 0.52})
     expected = {"ground_penetration": 0.25, "ground_penetration_depth": 0.05}
     assert result(GroundPenetration(), *batch) == pytest.approx(expected)
+
+
+@WHO
+def test_who_is_down_equals_a_plain_loop(choose: Choose) -> None:
+    batch = draw_batch(scenes=6, frames=24)
+    generated, counts = batch[0].double().numpy(), scored(batch, choose)
+    down, frames = 0, 0
+    for s, b, t, p in itertools.product(range(4), range(6), range(24), range(3)):
+        if counts[b][t][p]:
+            frames += 1
+            down += generated[s, b, t, p, 0, 1] < 0.6
+    assert 0 < down < frames
+    assert result(Down(), *batch, agents=choose(batch)) == pytest.approx({"down": down / frames}, abs=1e-12)
 
 
 @WHO
