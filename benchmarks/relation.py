@@ -19,6 +19,9 @@ from typing import NamedTuple
 
 from magnet.cli.provenance import machine
 
+DOWN = 0.012
+"""Share of their frames in which the training takes' couples have the pelvis under 60 cm: drops and dips."""
+
 Rows = dict[str, dict[str, float]]
 """Rows of a table of results, by name: magnet, NN, ridge, training set, ground truth, ..."""
 
@@ -84,7 +87,7 @@ def bars() -> list[Bar]:
         deepest = 0.0 if run == joint else 0.002
         listed.append(Bar(run, "frames over 10 cm deep", of("depth_over_10cm"), fixed(deepest)))
         listed.append(Bar(run, "frames in which somebody floats", of("floating"), fixed(0.0)))
-        listed.append(Bar(run, "frames in which somebody is down", of("down"), fixed(0.0)))
+        listed.append(Bar(run, "frames in which somebody is down", of("down"), fixed(DOWN)))
     return listed
 
 

@@ -51,8 +51,8 @@ class Floating(ClipMeans):
 class Down(ClipMeans):
     """`down`: share of a person's frames with the pelvis under `below` metres: who sits, kneels, lies, does the splits.
 
-    Dancers lunge and dip their partners with the pelvis higher; read it beside the recording's. Averages of joints hide
-    one sample in twenty that ends on the floor.
+    Dancers drop and are dipped too, so read it beside the recording's. Averages hide one sample in twenty that ends on
+    the floor.
 
     >>> import torch
     >>> from magnet.testing import standing_people
