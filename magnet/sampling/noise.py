@@ -180,8 +180,8 @@ def opening_levels(first: int, count: int) -> Tensor:
     highest, lowest = OPENING
     to = min(max(float(half_log_snr(torch.tensor(first))), highest), lowest)
     wanted = torch.linspace(highest, to, count + 1, dtype=torch.float64)[:-1]
-    levels = nearest_levels(wanted)[1:-1].unique().flip(0)
-    return levels[(levels < LEVELS) & (levels > first)]
+    levels = nearest_levels(wanted)[1:-1]
+    return levels[levels > first]
 
 
 @dataclass
