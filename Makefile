@@ -6,7 +6,7 @@ WORKERS ?= auto
 
 PY := $(VENV)/bin/python
 # Files are dealt out to a process a core; what a file's tests share is made once.
-PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile
+PYTEST := $(PY) -m pytest -q -n $(WORKERS) --maxprocesses 8 --dist loadfile --durations 8
 READY := $(VENV)/.ready
 SHELL := /bin/sh
 # Python keeps what it compiles: the tests start many processes, which would each compile everything again.

@@ -5,12 +5,16 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from magnet import checkpoints
+from magnet.cli import child
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
 from tests.scripts import module_at
@@ -163,11 +167,34 @@ def beginnings(folder: Path, frames: int = 300) -> Path:
     return folder
 
 
+class Watched(subprocess.Popen):
+    """A program that says where it hangs, and ends, after a quarter of an hour: else no test behind it would."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        try:
+            return super().wait(timeout or 900)
+        except subprocess.TimeoutExpired:
+            for number in (signal.SIGCONT, signal.SIGABRT):
+                self.send_signal(number)
+            return super().wait()
+
+
+def test_what_hangs_says_where(monkeypatch, capfd) -> None:
+    monkeypatch.setenv("PYTHONFAULTHANDLER", "1")
+    hung = Watched([sys.executable, "-c", "import time\nprint(1, flush=True)\ntime.sleep(60)"], stdout=subprocess.PIPE)
+    assert hung.stdout is not None and hung.stdout.readline()
+    assert hung.wait(0.01) == -signal.SIGABRT
+    hung.stdout.close()
+    assert "most recent call first" in capfd.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path(RECORDINGS).is_dir(), reason="needs CMU's recordings: set MAGNET_CMU")
 def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
     monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONFAULTHANDLER", "1")
+    monkeypatch.setattr(child.subprocess, "Popen", Watched)
     couples = {"class_path": "CMU", "init_args": {"test_takes": [5, 10, 15], "val_takes": [3]}}
     few = {"class_path": "Synthetic", "init_args": {"people": [2], "train_clips": 15}}  # else each takes minutes
     data = ["--data.data", json.dumps([couples, few]), "--data.weights", "null"]
