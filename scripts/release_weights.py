@@ -3,8 +3,9 @@
     python scripts/release_weights.py runs/duet_denoiser/latest/checkpoints/last.ckpt duet
 
 writes magnet/weights/duet: tensors in float16 safetensors, and config.json with how to build the model, what it was
-trained on, and a hash of every part. `--decoder CHECKPOINT` takes the decoder of a tokenizer that went on alone. What
-it was trained on is known of the data of configs/duet_*.yaml; of others `--trained_on` says it.
+trained on, and a hash of every part. `--decoder CHECKPOINT` takes the decoder of a tokenizer that went on alone; where
+the folder is there already, and its decoder is the checkpoint's, how that was trained is not forgotten. What a model
+was trained on is known of the data of configs/duet_*.yaml; of others `--trained_on` says it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from magnet import checkpoints, datamodules
 
@@ -80,6 +82,18 @@ def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:
     return {key: json.loads(record.read_text())} if record and record.exists() else {}
 
 
+def decoder_kept(state: dict[str, Tensor], replaced: Path) -> dict[str, Any]:
+    """The record of the decoder's run in a released folder, where its decoder is the checkpoint's; else nothing."""
+    said = replaced / "config.json"
+    record = json.loads(said.read_text())["about"].get("decoder run") if said.is_file() else None
+    if record is None:
+        return {}
+    before = checkpoints.read(replaced)["state_dict"]
+    names = [name for name in before if name.startswith("tokenizer.vqvae.decoder.")]
+    same = all(name in state and torch.equal(state[name].half(), before[name].half()) for name in names)
+    return {"decoder run": record} if same else {}
+
+
 def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[str, Any]:
     """A denoiser's checkpoint with the decoder of a tokenizer that was trained on with `decoder_only`.
 
@@ -130,10 +144,12 @@ def main(arguments: list[str] | None = None) -> None:
     data = (
         {"trained on": given.trained_on} if given.trained_on else {"trained on": TRAINED_ON, "recordings": manifest()}
     )
-    about = data | ABOUT | run_of("run", given.checkpoint) | run_of("decoder run", given.decoder)
+    replaced = given.folder / given.name
+    decoder = run_of("decoder run", given.decoder) or decoder_kept(checkpoint["state_dict"], replaced)
+    about = data | ABOUT | run_of("run", given.checkpoint) | decoder
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])
-    folder = checkpoints.write(checkpoint, given.folder / given.name, without_folders(about))
+    folder = checkpoints.write(checkpoint, replaced, without_folders(about))
     parts = sorted(folder.glob("*.safetensors"))
     size = sum(part.stat().st_size for part in parts) / 1e6
     print(f"{folder}: {len(parts)} parts, {size:.1f} MB")

@@ -124,6 +124,18 @@ def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoi
             with_decoder(checkpoint, tokenizer | {"state_dict": other})
 
 
+def test_how_a_decoder_was_trained_is_kept_with_it_and_with_no_other(checkpoint, tmp_path: Path) -> None:
+    kept = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").decoder_kept
+    name = "tokenizer.vqvae.decoder.b"
+    checkpoint["state_dict"][name] = torch.randn(3, 3)
+    assert kept(checkpoint["state_dict"], tmp_path / "new") == {}
+    about = {"decoder run": {"command": "magnet fit"}}
+    released = checkpoints.write(checkpoint, tmp_path / "old", about)
+    assert kept(checkpoint["state_dict"], released) == about
+    assert kept(checkpoint["state_dict"] | {name: torch.randn(3, 3)}, released) == {}
+    assert kept(checkpoint["state_dict"], checkpoints.write(checkpoint, tmp_path / "none")) == {}
+
+
 def test_what_weights_were_trained_on_is_only_told_of_the_data_that_it_is_known_of() -> None:
     ours = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").ours
     cmu = {"class_path": "magnet.datamodules.CMU", "init_args": {"test_takes": [5, 10, 15], "val_takes": [3]}}
