@@ -47,6 +47,8 @@ from magnet.tasks.joint import JointFuture
 CONTEXT, WINDOW = 4, 150
 HEAD, FEET = 15, (10, 11)
 COUPLINGS = ("mirror", "follow", "handshake", "circle", "patty_cake")
+STRIDE = 48
+"""Frames of a stride of `duet`, twelve tokens."""
 PARTED = 3.0
 """Metres between two pelvises over the ground over which couples have left each other: recorded ones come to 2.6."""
 LOW = 1.1
@@ -152,6 +154,16 @@ def lows(joints: Tensor, present: Tensor, recorded: Tensor) -> dict[str, float]:
     }
 
 
+def pulse(joints: Tensor) -> float:
+    """Acceleration of the joints in the worst of a stride's frames, over the mean of all: 1 where strides do not show.
+
+    (B, T, P, 22, 3)
+    """
+    size = joints.diff(n=2, dim=1).norm(dim=-1).mean(dim=(0, 2, 3))
+    phases = torch.stack([size[phase::STRIDE].mean() for phase in range(STRIDE)])
+    return float(phases.max() / phases.mean())
+
+
 def slowest(people: Tensor) -> Tensor:
     """Mean speed of the joints in the stillest second of anybody: near 0 is frozen. (M, T, 22, 3)"""
     speed = 30 * people.diff(dim=1).norm(dim=-1).mean(dim=-1)
@@ -240,6 +252,8 @@ def main() -> None:
         "recorded": describe(real_joints, real.present) | lows(real_joints, real.present, poses),
         "recorded, training takes": describe(others, training.present),
         "head low in training takes, share": float((poses[:, HEAD, 1] < LOW).float().mean()),
+        "pulse of strides after 5 s": pulse(body.joints(long.slice(CONTEXT + WINDOW, long.frames))),
+        "pulse of recordings": pulse(real_joints),
         "finite": all(bool(value.isfinite().all()) for value in long.tensors().values()),
         "seconds": round(seconds, 1),
         "frames a second": round(given.frames * len(chosen) / seconds, 1),
