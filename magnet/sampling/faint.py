@@ -28,14 +28,16 @@ def faint_levels(
     if guidance.stabilization_level:
         sure = shown_clean(known, guidance.stabilization_after, since)
         levels = torch.where(sure, 0, guidance.stabilization_level)
+        if guidance.stabilization_newest is not None:
+            newest = torch.arange(len(known))[:, None] >= stage.active[0] - 1
+            levels = torch.where(newest, levels.clamp_max(guidance.stabilization_newest), levels)
     if guidance.stabilization_unseen and stage.apart:
         lately = torch.where(shown_clean(known, AFTER_UNSEEN, since), 0, guidance.stabilization_unseen)
         levels = lately if levels is None else torch.maximum(levels, lately)
     if guidance.stabilization_beside and not live:
         given = known[stage.start : stage.stop].all(dim=0)
         beside = (given.sum() > given.long()) & ~known
-        highest = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
-        levels = torch.where(beside, highest, 0 if levels is None else levels)
+        levels = torch.where(beside, guidance.stabilization_beside, 0 if levels is None else levels)
     return levels
 
 
