@@ -37,6 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "stabilization_level": 0,
             "stabilization_after": 0,
             "stabilization_newest": None,
+            "stabilization_live": None,
             "stabilization_beside": 0,
             "stabilization_unseen": 0,
             "cond_weight": 0.0,  # the paper has no conditions

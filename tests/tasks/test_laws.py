@@ -86,7 +86,7 @@ def test_joint_future_needs_a_past():
         Guidance("partner", paper_average=True),
         Guidance(smooth=0.1),
         Guidance(stabilization_level=50),
-        Guidance(stabilization_level=50, stabilization_newest=20),
+        Guidance(stabilization_level=50, stabilization_newest=20, stabilization_live=30),
         Guidance(stabilization_unseen=50),
     ],
     ids=["history", "self", "partner", "smooth", "faint", "newest", "unseen"],
