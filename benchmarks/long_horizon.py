@@ -202,8 +202,8 @@ def measured(
     return curve
 
 
-def main() -> None:
-    """Generate, measure, draw."""
+def options() -> argparse.Namespace:
+    """What the command line says."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ckpt_path", default=None)
     parser.add_argument("--out", type=Path, default=Path("runs/results/long"))
@@ -219,7 +219,12 @@ def main() -> None:
     )
     parser.add_argument("--noise_scale", type=float, help="of new noise in denoising; default: the model's")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="fp32")
-    given = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Generate, measure, draw."""
+    given = options()
     body, model = load_body(), Denoiser.load(given.ckpt_path)
     data = CMU(singles=False, max_agents=model.layout.agents)
     starts = [
@@ -230,11 +235,11 @@ def main() -> None:
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
     kind = "history" if given.guidance else "none"
     guidance = Guidance(kind, given.guidance, stabilization_level=given.stabilization_level)
-    options = SamplerOptions(given.steps, None, given.pyramid_offset, noise_scale=given.noise_scale, guidance=guidance)
+    sampler = SamplerOptions(given.steps, None, given.pyramid_offset, noise_scale=given.noise_scale, guidance=guidance)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()
     with torch.autocast("cpu", torch.bfloat16, given.precision == "bf16"):
-        long = generate(model, concatenate(chosen), JointFuture(), CONTEXT, given.frames, 1, options, generator)
+        long = generate(model, concatenate(chosen), JointFuture(), CONTEXT, given.frames, 1, sampler, generator)
     seconds = time.perf_counter() - began
 
     real, training = windows(data, "test"), windows(data, "train")
