@@ -204,9 +204,7 @@ class Sampling:
         noise_scale: standard deviation of the new noise in each denoising step.
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
-        stabilization_newest: a lower such level for the last token step before those in work.
-        stabilization_live: such a level, in place of these, in tasks that go on live.
-        stabilization_beside: such a level, in place of these, for people beside somebody whose motion is given.
+        stabilization_beside: a higher such level for people beside somebody whose motion is given.
         stabilization_unseen: such a level in tasks whose agents act without seeing what others do next.
     """
 
@@ -219,8 +217,6 @@ class Sampling:
     noise_scale: float | None = None
     stabilization_level: int | None = None
     stabilization_after: int = 0
-    stabilization_newest: int | None = None
-    stabilization_live: int | None = None
     stabilization_beside: int | None = None
     stabilization_unseen: int | None = None
 

@@ -22,26 +22,20 @@ def faint_levels(
         known: (N, P) bool, tokens that were given; they are shown clean.
         stage: on the same rows.
         since: (P,) int, as for `shown_clean`.
-        live: whether poses are final as soon as their tokens are; then nobody's are fainter `beside` others, and
-            `stabilization_live` counts.
+        live: whether poses are final as soon as their tokens are; then nobody's are fainter `beside` others.
     """
     levels = None
     if guidance.stabilization_level:
         sure = shown_clean(known, guidance.stabilization_after, since)
-        level, lately = guidance.stabilization_level, guidance.stabilization_newest
-        if live and guidance.stabilization_live is not None:
-            level, lately = guidance.stabilization_live, None
-        levels = torch.where(sure, 0, level)
-        if lately is not None:
-            newest = torch.arange(len(known))[:, None] >= stage.active[0] - 1
-            levels = torch.where(newest, levels.clamp_max(lately), levels)
+        levels = torch.where(sure, 0, guidance.stabilization_level)
     if guidance.stabilization_unseen and stage.apart:
-        unseen = torch.where(shown_clean(known, AFTER_UNSEEN, since), 0, guidance.stabilization_unseen)
-        levels = unseen if levels is None else torch.maximum(levels, unseen)
+        lately = torch.where(shown_clean(known, AFTER_UNSEEN, since), 0, guidance.stabilization_unseen)
+        levels = lately if levels is None else torch.maximum(levels, lately)
     if guidance.stabilization_beside and not live:
         given = known[stage.start : stage.stop].all(dim=0)
         beside = (given.sum() > given.long()) & ~known
-        levels = torch.where(beside, guidance.stabilization_beside, 0 if levels is None else levels)
+        highest = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
+        levels = torch.where(beside, highest, 0 if levels is None else levels)
     return levels
 
 

@@ -39,14 +39,10 @@ class Guidance:
             clean. None: as the model is best sampled, or 0.
         stabilization_after: token steps after the last given one of the same person, or the beginning, that are shown
             clean too. Read where `stabilization_level` is said.
-        stabilization_newest: level at which the last token step before those in work is shown, where it is lower:
-            motion goes on from it, and jolts where it drowns. None: as the others. Read as the one before.
-        stabilization_live: such a level, in place of the first and of the newest's, in tasks that go on live, where a
-            token is made from few others. None: as in other tasks. Read as the one before.
-        stabilization_beside: such a level, in place of these, for people beside somebody who is given throughout the
-            window, in tasks that are not live (partner inpainting), and not in crowds: the given one tells more of
-            where they are than a past that is a little wrong, and which keeps them wrong. None: as the model is best
-            sampled where `stabilization_level` is open too, or 0.
+        stabilization_beside: a higher such level for people beside somebody who is given throughout the window, in
+            tasks that are not live (partner inpainting), and not in crowds: the given one tells more of where they are
+            than a past that is a little wrong, and which keeps them wrong. None: as the model is best sampled where
+            `stabilization_level` is open too, or 0.
         stabilization_unseen: such a level, for everybody, in tasks whose agents act without seeing what others do next
             (in step), from the second token step that was made on: from a clean past alone each token goes on as the
             one before, a little slower, and people come to a rest. The higher level counts. None: as
@@ -61,8 +57,6 @@ class Guidance:
     smooth: float = 0.0
     stabilization_level: int | None = None
     stabilization_after: int = 0
-    stabilization_newest: int | None = None
-    stabilization_live: int | None = None
     stabilization_beside: int | None = None
     stabilization_unseen: int | None = None
     cond_weight: float = 0.0
@@ -72,8 +66,7 @@ class Guidance:
         require_number("weight", self.weight, least=0)
         require_number("smooth", self.smooth, least=0)
         require_number("cond_weight", self.cond_weight, least=0)
-        for name in ("level", "newest", "live", "beside", "unseen"):
-            name = f"stabilization_{name}"
+        for name in ("stabilization_level", "stabilization_beside", "stabilization_unseen"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 0, LEVELS - 1)
         require_whole("stabilization_after", self.stabilization_after, 0)

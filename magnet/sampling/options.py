@@ -173,7 +173,7 @@ class SamplerOptions:
         ]
         guidance, open_levels = self.guidance, []
         if guidance.stabilization_level is None:
-            open_levels += [f"stabilization_{name}" for name in ("level", "after", "newest", "live")]
+            open_levels += ["stabilization_level", "stabilization_after"]
             special = ("stabilization_beside", "stabilization_unseen")
             open_levels += [name for name in special if getattr(guidance, name) is None]
         guidance = replace(guidance, **{name: getattr(best, name) for name in open_levels if hasattr(best, name)})

@@ -36,8 +36,6 @@ PRESETS: dict[str, dict[str, Any]] = {
             "smooth": 0.0,
             "stabilization_level": 0,
             "stabilization_after": 0,
-            "stabilization_newest": None,
-            "stabilization_live": None,
             "stabilization_beside": 0,
             "stabilization_unseen": 0,
             "cond_weight": 0.0,  # the paper has no conditions

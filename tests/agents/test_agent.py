@@ -65,7 +65,7 @@ def together(members: Sequence, tokens: int, link: Lossy, order=(1, 0, 2)) -> li
 @pytest.mark.parametrize("kind", TASKS)
 def test_without_loss_agents_make_what_one_process_makes_bit_for_bit(start, kind, posterior):
     """Of a model, too, that is best sampled with averaged paths, and what it made shown faintly."""
-    apart = {"stabilization_unseen": 250, "stabilization_newest": 30, "stabilization_live": 60}
+    apart = {"stabilization_unseen": 250}
     best = Sampling(settle="hold", smooth_path=True, stabilization_level=100, **apart) if posterior else Sampling()
     denoiser = tiny_denoiser(max_agents=4, window=8, network={"pairwise_posterior": posterior}, sampling=best)
     task, frames, plain = TASKS[kind], 4 * 8, replace(REFERENCE, settle="off")

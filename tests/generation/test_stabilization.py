@@ -115,36 +115,11 @@ def test_of_two_levels_the_higher_one_counts() -> None:
     assert shown(replace(guidance, stabilization_unseen=0)) == [0, 0, 0, 450, 450]
 
 
-def test_the_token_that_motion_goes_on_from_is_shown_better() -> None:
-    """Eight token steps, two given, strides of two, of which the last is in work; a higher `newest` changes nothing."""
-    known = (torch.arange(8) < 2)[:, None].expand(8, 2)
-    grid = Grid(tokens=8, agents=2, context=2, window=4, stride=2, pyramid_offset=0)
-    stage = JointFuture().schedule(grid).stages[-1]
-    assert stage.active == (6, 8)
-
-    def shown(newest: int | None, live: bool = False) -> list[int]:
-        guidance = Guidance(stabilization_level=450, stabilization_newest=newest, stabilization_live=300)
-        levels = faint_levels(guidance, known, stage, live=live)
-        assert levels is not None
-        return levels[:6, 0].tolist()
-
-    assert shown(None) == shown(700) == [0, 0, 450, 450, 450, 450]
-    assert shown(100) == [0, 0, 450, 450, 450, 100]
-    assert shown(0) == [0, 0, 450, 450, 450, 0]
-    assert shown(100, live=True) == [0, 0, 300, 300, 300, 300]
-
-
 @pytest.mark.parametrize("name", ["joint_future", "motion_control", "agentic_sync"])
 def test_a_stream_knows_how_long_ago_somebody_was_given(model, name) -> None:
     """Rows that are let go hold what was given last; frames come as from one call."""
     start = random_scene(1, 80, 2, torch.Generator().manual_seed(4))
-    guidance = Guidance(
-        stabilization_level=300,
-        stabilization_after=5,
-        stabilization_newest=40,
-        stabilization_live=200,
-        stabilization_unseen=100,
-    )
+    guidance = Guidance(stabilization_level=300, stabilization_after=5, stabilization_unseen=100)
     options = SamplerOptions(2, 2, pyramid_offset=0, guidance=guidance, settle="off")
     task = registry.get(name)()
     whole = generate(model, start, task, 8, 72, 1, options, torch.Generator().manual_seed(0))

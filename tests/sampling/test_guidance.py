@@ -202,12 +202,6 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
     clean = Guidance(stabilization_level=0)
     assert SamplerOptions(guidance=clean).filled(both).guidance == clean
     assert not SamplerOptions.preset("paper").filled(both).guidance.stabilization_beside
-    levels = {"stabilization_level": 60, "stabilization_newest": 20, "stabilization_live": 40}
-    newest = Sampling(**levels)
-    assert SamplerOptions().filled(newest).guidance == Guidance(**levels)
-    named = Guidance(stabilization_level=50)
-    assert SamplerOptions(guidance=named).filled(newest).guidance == named
-    assert SamplerOptions.preset("paper").filled(newest).guidance.stabilization_newest is None
     unseen = Sampling(stabilization_level=60, stabilization_unseen=90)
     assert SamplerOptions().filled(unseen).guidance == Guidance(stabilization_level=60, stabilization_unseen=90)
     assert SamplerOptions(guidance=clean).filled(unseen).guidance == clean

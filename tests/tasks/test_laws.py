@@ -86,10 +86,9 @@ def test_joint_future_needs_a_past():
         Guidance("partner", paper_average=True),
         Guidance(smooth=0.1),
         Guidance(stabilization_level=50),
-        Guidance(stabilization_level=50, stabilization_newest=20, stabilization_live=30),
         Guidance(stabilization_unseen=50),
     ],
-    ids=["history", "self", "partner", "smooth", "faint", "newest", "unseen"],
+    ids=["history", "self", "partner", "smooth", "faint", "unseen"],
 )
 def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, guidance: Guidance):
     task, grid = registry.get(name)(), Grid(8, 3, 3, steps=4, window=6, stride=2)
