@@ -199,7 +199,7 @@ def least_squares(
 
     def product(x: Tensor, y: Tensor) -> Tensor:
         """Scene by scene, so that scenes do not depend on each other. -> (B, 1, 1, 1)"""
-        return (x * y).sum(dim=(1, 2, 3), keepdim=True)
+        return (x * y).sum(dim=(1, 2, 3), keepdim=True, dtype=torch.float64).to(x.dtype)
 
     gradient = back(short + across(step)) + smooth.slope(offset) + smooth(step)
     residual = -gradient
