@@ -99,7 +99,8 @@ class Smoothness:
         self.scale[:3], self.scale[3:9], self.scale[9:15] = settle.root, settle.tilt, min(settle.shrug, STIFF)
         self.scale[1] *= settle.lift
         whole = stiffness(settle, self.lead + free.shape[1])
-        self.cost = whole.to(like)[self.lead :]  # (T, L + T)
+        # In double precision: it ends nearly in nothing where a correction is smooth, and threads split its sums.
+        self.cost = whole.to(like.device)[self.lead :]  # (T, L + T)
         keep = free.transpose(1, 2)  # (B, P, T)
         self.free = keep[..., None] & keep[..., None, :]
         self.undone = self.inverse(0.0) * self.free  # (B, P, T, T), 0 for whoever is fixed
@@ -107,41 +108,39 @@ class Smoothness:
     def inverse(self, pull: float) -> Tensor:
         """Inverse of one number's cost with `pull` added for each frame. -> (B, P, T, T)"""
         T = self.cost.shape[0]
-        own = self.cost[:, self.lead :].double()
+        own = self.cost[:, self.lead :]
         eye = torch.eye(T, dtype=own.dtype, device=own.device)
         # Not linalg.inv: torch's batched LU fails on more than 150 rows with several threads (pytorch issue 142815).
-        return torch.cholesky_inverse(torch.linalg.cholesky(torch.where(self.free, own + pull * eye, eye))).to(
-            self.cost
-        )
+        return torch.cholesky_inverse(torch.linalg.cholesky(torch.where(self.free, own + pull * eye, eye)))
 
     def toward(self, ground: Tensor) -> Tensor:
         """A smooth correction that moves people about so far over the ground. (B, T, P, 2) metres -> (B, T, P, DOFS)"""
         pull = FOLLOWS / float(self.scale[0])
         offset = ground.new_zeros(*ground.shape[:3], len(self.scale))
-        offset[..., [0, 2]] = pull * (self.inverse(pull) @ ground.transpose(1, 2)).transpose(1, 2)
+        offset[..., [0, 2]] = pull * (self.inverse(pull) @ ground.transpose(1, 2).double()).transpose(1, 2).to(ground)
         return offset
 
     def __call__(self, offset: Tensor) -> Tensor:
         """The cost's matrix times an offset. (B, T, P, DOFS) -> same"""
-        return (self.cost[:, self.lead :] @ offset.flatten(2)).view_as(offset) * self.scale
+        return (self.cost[:, self.lead :] @ offset.flatten(2).double()).to(offset).view_as(offset) * self.scale
 
     def slope(self, offset: Tensor) -> Tensor:
         """The gradient of the cost, the past's corrections included, with `start` free. (B, T, P, DOFS) -> same"""
         offset = offset - self.start
         whole = offset if self.past is None else torch.cat([self.past, offset], dim=1)
-        return (self.cost @ whole.flatten(2)).view_as(offset) * self.scale
+        return (self.cost @ whole.flatten(2).double()).to(offset).view_as(offset) * self.scale
 
     @functools.cached_property
     def linked(self) -> Tensor:
         """How far a force on a node moves another, times `scale`: 0 between two people. -> (B, T P, T P)"""
         B, P, T, _ = self.undone.shape
-        whole = self.undone.new_zeros(B, T, P, T, P)
+        whole = self.scale.new_zeros(B, T, P, T, P)
         whole.diagonal(dim1=2, dim2=4).copy_(self.undone.permute(0, 2, 3, 1))
         return whole.view(B, T * P, T * P)
 
     def undo(self, force: Tensor) -> Tensor:
         """The inverse of the cost's matrix times a force. (B, T, P, DOFS) -> same"""
-        return (self.undone @ force.transpose(1, 2)).transpose(1, 2) / self.scale
+        return (self.undone @ force.transpose(1, 2).double()).transpose(1, 2).to(force) / self.scale
 
 
 def solve(
@@ -199,7 +198,7 @@ def least_squares(
 
     def product(x: Tensor, y: Tensor) -> Tensor:
         """Scene by scene, so that scenes do not depend on each other. -> (B, 1, 1, 1)"""
-        return (x * y).sum(dim=(1, 2, 3), keepdim=True, dtype=torch.float64).to(x.dtype)
+        return (x * y).sum(dim=(1, 2, 3), keepdim=True)
 
     gradient = back(short + across(step)) + smooth.slope(offset) + smooth(step)
     residual = -gradient
