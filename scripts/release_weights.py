@@ -136,6 +136,8 @@ def main(arguments: list[str] | None = None) -> None:
         require_kind(checkpoint, "denoiser")
         if given.decoder:
             checkpoint = with_decoder(checkpoint, checkpoints.read(given.decoder))
+        replaced = given.folder / given.name
+        decoder = run_of("decoder run", given.decoder) or decoder_kept(checkpoint["state_dict"], replaced)
     except (OSError, ValueError, KeyError) as error:
         options.error(str(error).splitlines()[0])
     known = ours((checkpoint.get("magnet_config") or {}).get("data"))
@@ -144,8 +146,6 @@ def main(arguments: list[str] | None = None) -> None:
     data = (
         {"trained on": given.trained_on} if given.trained_on else {"trained on": TRAINED_ON, "recordings": manifest()}
     )
-    replaced = given.folder / given.name
-    decoder = run_of("decoder run", given.decoder) or decoder_kept(checkpoint["state_dict"], replaced)
     about = data | ABOUT | run_of("run", given.checkpoint) | decoder
     for part in [name for name in checkpoint if name != "state_dict"]:
         checkpoint[part] = without_folders(checkpoint[part])

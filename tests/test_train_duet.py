@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -20,7 +19,6 @@ from magnet.testing import tiny_denoiser
 from tests.scripts import module_at
 
 ROOT = Path(__file__).resolve().parents[1]
-RECORDINGS = os.environ.get("MAGNET_CMU") or str(ROOT.parent / "shared" / "data" / "cmu")
 
 
 recipe = module_at(ROOT / "scripts" / "train_duet.py")
@@ -153,15 +151,15 @@ def test_what_others_began_from_does_not_go_on(tmp_path: Path) -> None:
             recipe.steps_left(tmp_path, dict.fromkeys(recipe.STAGES, 3) | {stage: 5})
 
 
-def beginnings(folder: Path, frames: int = 300) -> Path:
+def beginnings(recordings: Path, folder: Path, frames: int = 300) -> Path:
     """So many frames of a few recordings: couples to train, validate and test on, and somebody alone."""
     folder.mkdir()
     for name in ("60.asf", "61.asf", "02.asf"):
-        (source,) = Path(RECORDINGS).rglob(name)
+        (source,) = recordings.rglob(name)
         (folder / name).write_bytes(source.read_bytes())
     couples = [f"{subject}_{take}" for subject in ("60", "61") for take in ("01", "03", "05")]
     for name in (*couples, "02_01", "02_04", "02_06", "02_08"):
-        (source,) = Path(RECORDINGS).rglob(f"{name}.amc")
+        (source,) = recordings.rglob(f"{name}.amc")
         text = source.read_text(encoding="latin-1")
         (folder / source.name).write_text(text.partition(f"\n{frames + 1}\n")[0] + "\n", encoding="latin-1")
     return folder
@@ -189,9 +187,10 @@ def test_what_hangs_says_where(monkeypatch, capfd) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path(RECORDINGS).is_dir(), reason="needs CMU's recordings: set MAGNET_CMU")
-def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(tmp_path: Path, monkeypatch, capfd) -> None:
-    monkeypatch.setenv("MAGNET_CMU", str(beginnings(tmp_path / "recordings")))
+def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(
+    cmu_root: Path, tmp_path: Path, monkeypatch, capfd
+) -> None:
+    monkeypatch.setenv("MAGNET_CMU", str(beginnings(cmu_root, tmp_path / "recordings")))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PYTHONFAULTHANDLER", "1")
     monkeypatch.setattr(child.subprocess, "Popen", Watched)
