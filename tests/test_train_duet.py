@@ -20,7 +20,6 @@ from tests.scripts import module_at
 
 ROOT = Path(__file__).resolve().parents[1]
 
-
 recipe = module_at(ROOT / "scripts" / "train_duet.py")
 
 
