@@ -76,19 +76,20 @@ def read(
     up: str | None = None,
     joints: dict[str, str] | None = None,
     keep_floor: bool = False,
+    in_fps: float | None = None,
 ) -> Motion:
     """Read a scene from our own file, SMPL-X npz files or BVH files of any skeleton; several files are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor: as in `magnet.export.load_bvh`.
+        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
-    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor)
+    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps)
     got = formats.read(list(paths), body, options)
     return Motion.of(got.scene, got.body, got.notes)
 

@@ -31,7 +31,8 @@ def add_body(options: Options) -> None:
 
 
 def add_origin(options: Options) -> None:
-    """--in_unit, --up, --keep_floor and --joint, for files of other programs."""
+    """--in_fps, --in_unit, --up, --keep_floor and --joint, for files of other programs."""
+    options.add_argument("--in_fps", **IN_FPS)
     options.add_argument(
         "--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs; of .npz m)"
     )
@@ -52,6 +53,7 @@ def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
         up=options.up,
         joints=dict(pair.partition("=")[::2] for pair in options.joint),
         keep_floor=options.keep_floor,
+        in_fps=options.in_fps,
     )
 
 
@@ -63,6 +65,8 @@ def add_look(options: Options) -> None:
     options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
 
 
+IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz files that do not say it"}
+"""An option of commands that read files."""
 PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
 """An option that names a person, and may be repeated."""
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magnet.cli.flags import PlainParser
+from magnet.cli.scene_files import IN_FPS
 from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
@@ -43,6 +44,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--context", type=int, default=0, metavar="N", help=context)
     add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
+    add("--in_fps", **IN_FPS)
     styles = ("body", "light", "capsules", "skeleton")
     add("--style", choices=styles, help="default: body, light for crowds")
     add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
@@ -129,7 +131,7 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.viewer.takes import read_takes
 
     body = load_body(options.body or "open")
-    takes, body = read_takes(options.files, body, options.context, options.samples)
+    takes, body = read_takes(options.files, body, options.context, options.samples, options.in_fps)
     longest = max(each.scene.frames for each in takes)
     if options.context > longest:
         raise ValueError(f"--context {options.context}: got {longest} frames, so at most {longest} were given")
@@ -142,7 +144,7 @@ def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
 
     if not options.truth:
         return None
-    truth = read_takes([options.truth], body, samples=1)[0][0]
+    truth = read_takes([options.truth], body, samples=1, in_fps=options.in_fps)[0][0]
     if abs(truth.scene.fps - fps) > 1e-3:
         raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
     return truth

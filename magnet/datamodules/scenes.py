@@ -18,6 +18,7 @@ from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.registry import register_reader
+from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, SHAPE, WHOLE, posed, rotations
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec, to_rotvec
 from magnet.motion.scene import Scene
@@ -27,15 +28,9 @@ WIDTH = 66
 """Numbers of the pelvis and 21 body joints."""
 FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
 """Whose shape numbers go with so many rotation numbers a frame; 66, the body's alone, may be anybody's."""
-WHOLE = ("poses", "pose", "smpl_poses", "fullpose", "full_pose")
-ORIENT, BODY = ("root_orient", "global_orient", "poses_root"), ("pose_body", "body_pose", "poses_body")
-PLACE = ("trans", "transl", "smpl_trans", "translation")
-RATE = ("mocap_frame_rate", "mocap_framerate", "fps", "framerate", "frame_rate")
-SHAPE = ("betas", "shape", "beta")
-"""Keys that files may have for the same thing."""
 PERSON = "name of the person"
 """Our key for what somebody is called in a dict of people."""
-OPTIONAL = ("gender", "smpl_scaling", "body", "valid")
+OPTIONAL = ("gender", SCALE, "body", "valid")
 
 
 @dataclass(frozen=True)
@@ -157,8 +152,8 @@ class ScenesReader(OwnReader[PosedTrack]):
             where, {"rotations": poses.shape[-2], "translations": np.shape(place)[-2] if np.ndim(place) > 1 else 0}
         )
         places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3))
-        if "smpl_scaling" in held:  # AIST++: its translations are to be divided by it
-            places = places / floats(f"{where}: smpl_scaling", np.ravel(held["smpl_scaling"])[:1], (1,))
+        if SCALE in held:
+            places = places / floats(f"{where}: {SCALE}", np.ravel(held[SCALE])[:1], (1,))
         betas = _first(where, held, SHAPE, None)
         if not several:
             poses, places, betas = poses[None], places[None], None if betas is None else [betas]
@@ -277,7 +272,7 @@ def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if isinstance(held, Mapping):
         held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
     held = mapping(path, held)
-    if any(key in held for key in (*WHOLE, *ORIENT)):
+    if _posed(held):
         yield str(path), held
         return
     shared = {key: value for key, value in held.items() if key in (*RATE, *OPTIONAL)}
@@ -294,7 +289,7 @@ def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def _posed(held: Any) -> bool:
-    return isinstance(held, Mapping) and any(key in held for key in (*WHOLE, *ORIENT))
+    return isinstance(held, Mapping) and posed(held.keys())
 
 
 def _body_of(held: Mapping[str, Any]) -> str:
@@ -319,53 +314,19 @@ def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise:
 
 def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
     """Axis-angle numbers a frame, (T, D) or (P, T, D), D at least 66; and how many the file has."""
-    if any(key in held for key in WHOLE):
-        whole = _flat(where, _first(where, held, WHOLE), WIDTH)
-    else:
-        orient = _flat(where, _first(where, held, ORIENT), 3, joints=1)
-        body = _flat(where, _first(where, held, BODY), WIDTH - 3)
-        one_length(where, {"root": orient.shape[-2], "body": body.shape[-2]})
-        if orient.shape[:-1] != body.shape[:-1]:
-            raise DataError(
-                f"{where}: root {orient.shape} and body {body.shape} are of unequal numbers of people; {AGAIN}"
-            )
-        whole = np.concatenate([orient, body], axis=-1)
-    return whole, whole.shape[-1]
-
-
-def _flat(where: str, value: Any, least: int, joints: int | None = None) -> Doubles:
-    """Rotations as axis-angle numbers: (..., J, 3, 3) matrices, (..., J, 3) vectors or flat already -> (..., 3 J)
-
-    Args:
-        where: for messages.
-        value: as the file has it.
-        least: numbers a frame.
-        joints: J, where (people, frames, 3) would look like it.
-
-    Raises:
-        DataError: no numbers, another shape, no frames, NaN, or matrices that are no rotations.
-    """
-    array = np.asarray(value)
-    if array.dtype.kind not in "iuf" or array.ndim < 2:
-        raise DataError(f"{where}: rotations hold {array.dtype} {array.shape}, expected numbers a frame; {AGAIN}")
-    with np.errstate(over="ignore", invalid="ignore"):
-        array = array.astype(np.float64)
-    if array.ndim >= 4 and array.shape[-2:] == (3, 3):
-        square = np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2)
-        if not square or (np.linalg.det(array) < 0).any():
-            raise DataError(f"{where}: matrices that are no rotations; {AGAIN}")
-        array = to_rotvec(torch.from_numpy(array)).numpy()
-    if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):
-        array = array.reshape(*array.shape[:-2], -1)
-    if array.ndim not in (2, 3) or array.shape[-1] < least or 0 in array.shape:
-        none = "; it has no frames" if 0 in array.shape else ""
+    try:
+        whole = rotations(where, held)
+    except ValueError as error:
+        raise DataError(f"{error}; {AGAIN}") from error
+    if whole.shape[-1] < WIDTH or 0 in whole.shape:
+        none = "; it has no frames" if 0 in whole.shape else ""
         raise DataError(
-            f"{where}: rotations: got shape {np.shape(value)}, expected (frames, {least} or more) in axis-angle, or "
-            f"people first{none}; {AGAIN}"
+            f"{where}: rotations: got shape {whole.shape}, expected (frames, {WIDTH} or more) in axis-angle, or people "
+            f"first{none}; {AGAIN}"
         )
-    if not np.isfinite(array).all():
+    if not np.isfinite(whole).all():
         raise DataError(f"{where}: rotations hold NaN or infinity; {AGAIN}")
-    return array
+    return whole, whole.shape[-1]
 
 
 def _one_of(value: Any, person: int) -> Any:

@@ -18,8 +18,9 @@ from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
-from magnet.export.npz import read_smplx, save_smplx
+from magnet.export.npz import read_smplx, require_rate, save_smplx
 from magnet.export.retarget import load_bvh, together
+from magnet.export.smpl_keys import posed
 from magnet.export.usd import require_usd, save_usd
 from magnet.files import load_npz, regular
 from magnet.motion.resample import resampled
@@ -55,6 +56,7 @@ class Reading:
         up: axis of the file that points up; None: found.
         joints: for BVH: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
+        in_fps: frames a second of npz files that do not say it.
     """
 
     fps: float | None = None
@@ -63,6 +65,7 @@ class Reading:
     up: str | None = None
     joints: Mapping[str, str] = field(default_factory=dict)
     keep_floor: bool = False
+    in_fps: float | None = None
 
 
 def read(
@@ -88,8 +91,13 @@ def read(
             raise FileNotFoundError(f"{file}: no such file")
         regular(file)
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
+    if options.in_fps is not None:
+        require_number("in_fps", options.in_fps, over=0)
     if suffixes == {".bvh"}:
-        imported = load_bvh(files, body, **vars(options))
+        if options.in_fps is not None:
+            raise ValueError("in_fps: is for .npz files that say no frame rate; a .bvh says its own, --fps resamples")
+        bvh = {name: value for name, value in vars(options).items() if name != "in_fps"}
+        imported = load_bvh(files, body, **bvh)
         notes = [str(source) for source in imported.sources]
         if imported.floor:
             way = "lowered" if imported.floor > 0 else "raised"
@@ -97,7 +105,7 @@ def read(
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
     scenes, notes, foreign = [], [], False
     for file in files:
-        scene, note, strange = _read_npz(file, body, options.up, options.unit)
+        scene, note, strange = _read_npz(file, body, options)
         scenes.append(scene)
         notes += note
         foreign |= strange
@@ -130,8 +138,9 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
     return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
 
 
-def _read_npz(path: Path, body: Body, up: str | None, unit: str | None = None) -> tuple[Scene, list[str], bool]:
+def _read_npz(path: Path, body: Body, options: Reading) -> tuple[Scene, list[str], bool]:
     """A scene of ours or SMPL-X's keys, told apart by what they hold; notes; whether other programs wrote it."""
+    up, unit = options.up, options.unit
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
     try:
@@ -139,7 +148,7 @@ def _read_npz(path: Path, body: Body, up: str | None, unit: str | None = None) -
             keys = set(file.files)
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    if "meta" in keys and not {"poses", "root_orient"} & keys:
+    if "meta" in keys and not posed(keys):
         if up not in (None, "y"):
             raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
         if unit not in (None, "m"):
@@ -147,12 +156,13 @@ def _read_npz(path: Path, body: Body, up: str | None, unit: str | None = None) -
                 f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
             )
         scene = Scene.load(path)
+        require_rate(path, scene.fps, options.in_fps)
         if scene.body != body.id:
             raise ValueError(
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
             )
         return scene, [], False
-    scene, found = read_smplx(path, body, up, unit)
+    scene, found = read_smplx(path, body, up, unit, options.in_fps)
     note, ours = [], {"body", "surface_model_type"} <= keys
     if up is None and found not in ("y", "z"):
         note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.export.rig import UNITS, UP
+from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, SHAPE, WHOLE, first_of, rotations
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -43,9 +44,9 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
         raise ValueError("nobody is present in the scene, so there is nobody to write")
     scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
-    rotations = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
-    poses = torch.zeros(*rotations.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)
-    poses[..., : 3 * BODY_JOINTS] = to_rotvec(rotations).flatten(-2).cpu()
+    turned = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
+    poses = torch.zeros(*turned.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)
+    poses[..., : 3 * BODY_JOINTS] = to_rotvec(turned).flatten(-2).cpu()
     rest_pelvis = body.rest_joints(scene.betas[0])[:, 0].double()
     transl = (T_world_root[..., :3, 3] - rest_pelvis[:, None]).cpu().numpy()
     arrays = {"poses": poses.numpy(), "transl": transl, "trans": transl, "betas": scene.betas[0].cpu().numpy()}
@@ -75,12 +76,15 @@ def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
     return read_smplx(path, body, up)[0]
 
 
-def read_smplx(path: str | Path, body: Body, up: str | None = None, unit: str | None = None) -> tuple[Scene, str]:
+def read_smplx(
+    path: str | Path, body: Body, up: str | None = None, unit: str | None = None, in_fps: float | None = None
+) -> tuple[Scene, str]:
     """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several.
 
-    Also read: AMASS's names (`trans`, `mocap_framerate`, `root_orient` and `pose_body`), more or fewer than ten betas
-    (the first ten count), no betas (zero). A file that does not name its body is SMPL-X's: its betas are taken if
-    `body` is not the open one, and are zero otherwise.
+    Also read: every name that `magnet.export.smpl_keys` knows (`trans`, `root_orient` and `pose_body`,
+    `global_orient` and `body_pose`, ...), rotations as matrices or joint by joint, more or fewer than ten betas (the
+    first ten count; the median where a person has several rows), no betas (zero). A file that does not name its body
+    is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise.
 
     Args:
         path: the file.
@@ -88,23 +92,26 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None, unit: str | 
         up: axis of the file that points up, one of `magnet.export.rig.UP`. None: y in files of ours, in others the
             axis along which pelvises stand.
         unit: of the file's lengths, one of `magnet.export.rig.UNITS`; None: metres, refused where nobody is so high.
+        in_fps: frames a second of a file that does not say it.
 
     Returns:
         The scene, B = 1, float32; and the axis of the file that points up.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no such file's keys or shapes, or another body's; no such unit, or another one than is said; turns
-            in degrees.
+        ValueError: no such file's keys or shapes, or another body's; no such unit, or another one than is said; no
+            frame rate, or another one than is said; turns in degrees.
     """
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    arrays, fps, written_for, name = _read(Path(path))
+    arrays, fps, written_for, name = _read(Path(path), in_fps)
     if written_for is not None and written_for != body.id:
         raise ValueError(f"{path}: written for body {written_for!r}, but {body.id!r} was given")
     poses, transl, betas = arrays["poses"], arrays["transl"], arrays["betas"]
     if poses.ndim == 2:
-        poses, transl, betas = poses[None], transl[None], betas.reshape(1, -1)
+        poses, transl, betas = poses[None], transl[None], betas[None]
+    if betas.ndim == 3 and betas.shape[1]:  # a row a frame, or one for all
+        betas = betas.quantile(0.5, dim=1)
     P, T = poses.shape[:2]
     fits = poses.ndim == 3 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
     if not fits or betas.ndim != 2 or len(betas) != P:
@@ -113,10 +120,10 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None, unit: str | 
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
     if written_for is None and body.id.startswith("open"):
         betas = torch.zeros_like(betas)
-    rotations = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
     _require_radians(path, poses)
+    turned = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
     pelvis = transl * UNITS[unit or "m"] + body.rest_joints(betas.float())[:, 0].double()[:, None]
-    T_world_root = rigid(rotations[:, :, 0], pelvis)
+    T_world_root = rigid(turned[:, :, 0], pelvis)
     if up is None:
         up = "y" if written_for is not None else _standing(T_world_root)
     if up not in UP:
@@ -125,7 +132,7 @@ def read_smplx(path: str | Path, body: Body, up: str | None = None, unit: str | 
     if unit is None:
         _require_metres(path, T_world_root)
     scene = Scene(
-        body_rot=rotations[:, :, 1:].transpose(0, 1)[None].float(),
+        body_rot=turned[:, :, 1:].transpose(0, 1)[None].float(),
         T_world_root=T_world_root.transpose(0, 1)[None].float(),
         betas=betas[None].float(),
         present=torch.ones(1, P, dtype=torch.bool),
@@ -166,42 +173,30 @@ def _standing(T_world_root: Tensor) -> str:
 HIGHEST, MOST_TURNED = 30.0, 9.0
 """Metres of a pelvis over the floor, and radians of a turn, which files in metres and radians do not hold."""
 
-ALSO = {"transl": ("transl", "trans"), "mocap_frame_rate": ("mocap_frame_rate", "mocap_framerate", "fps")}
-"""Our keys, and those that mean the same."""
 
-
-def _rate(path: Path, key: str, file: Mapping[str, np.ndarray]) -> float:
-    """Frames a second, which some programs write as an array of one number."""
+def _number(path: Path, key: str, file: Mapping[str, np.ndarray], what: str) -> float:
+    """A number, which some programs write as an array of one."""
     try:
-        (rate,) = np.ravel(file[key]).tolist()
-        return float(rate)
+        (number,) = np.ravel(file[key]).tolist()
+        return float(number)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {key}: expected one number, frames a second") from error
+        raise ValueError(f"{path}: {key}: expected one number, {what}") from error
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
+def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, str | None, str]:
     """Arrays by our keys, frames a second, the body that the file was written for if it says so, and its name."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         with load_npz(path) as file:
             there = set(file.files)
-            key = {name: next((k for k in keys if k in there), name) for name, keys in ALSO.items()}
-            parts = ["poses"] if "poses" in there else ["root_orient", "pose_body"]
-            missing = [part for part in parts if part not in there] and ["poses"]
-            missing += [name for name, its in key.items() if its not in there]
             ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
-            if ours and "betas" not in there:
-                missing.append("betas")
-            if missing:
-                has = ", ".join(sorted(there))
-                raise ValueError(f"{path}: lacks {', '.join(sorted(missing))}; it has {has}")
-            lengths = {part: file[part].shape[:-1] for part in parts}
-            if len(set(lengths.values())) > 1:
-                raise ValueError(f"{path}: {' and '.join(f'{part} {shape}' for part, shape in lengths.items())} differ")
-            poses = np.concatenate([file[part] for part in parts], axis=-1)
-            transl, fps = file[key["transl"]], _rate(path, key["mocap_frame_rate"], file)
-            betas = file["betas"] if "betas" in there else np.zeros((*poses.shape[:-2], 10))
+            _require_keys(path, there, ours, in_fps)
+            poses, transl = rotations(path, file), file[first_of(("transl", *PLACE), there) or ""]
+            if SCALE in there:
+                transl = transl / _number(path, SCALE, file, "by which translations are divided")
+            fps, shape = _rate(path, file, in_fps), first_of(SHAPE, there)
+            betas = np.zeros((*poses.shape[:-2], 10)) if shape is None else file[shape]
             written_for = str(file["body"]) if ours else None
             name = str(file["name"]) if "name" in there else ""
             given = file["given"] if written_for is not None and "given" in there else None
@@ -217,3 +212,36 @@ def _read(path: Path) -> tuple[dict[str, Tensor], float, str | None, str]:
             raise ValueError(f"{path}: given: got {given.dtype} {given.shape}, expected bool {poses.shape[:-1]}")
         tensors["given"] = torch.from_numpy(given)
     return tensors, fps, written_for, name
+
+
+def _require_keys(path: Path, there: Collection[str], ours: bool, in_fps: float | None) -> None:
+    """Refuse a file without motion or rate, by our names of what is missing."""
+    whole = first_of(WHOLE, there) or (first_of(ORIENT, there) and first_of(BODY, there))
+    unrated = in_fps is None and not first_of(RATE, there)
+    missing = ["mocap_frame_rate"] * unrated + ["poses"] * (not whole) + ["transl"] * (not first_of(PLACE, there))
+    if ours and "betas" not in there:
+        missing.insert(0, "betas")
+    if missing:
+        fix = "; say the frames a second: --in_fps 30 (in_fps=30)" if unrated else ""
+        raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {', '.join(sorted(there))}{fix}")
+
+
+def _rate(path: Path, file: Mapping[str, np.ndarray], in_fps: float | None) -> float:
+    """Frames a second, of the file or, where it says nothing, as given."""
+    key = first_of(RATE, file.keys())
+    fps = in_fps if key is None else _number(path, key, file, "frames a second")
+    assert fps is not None  # `_require_keys`
+    require_rate(path, fps, in_fps)
+    return fps
+
+
+def require_rate(path: str | Path, fps: float, in_fps: float | None) -> None:
+    """Refuse to call the frame rate of a file another than it says.
+
+    Raises:
+        ValueError: `in_fps`, frames a second, is given, and is not what the file says.
+    """
+    if in_fps is not None and abs(fps - in_fps) > 1e-6:
+        raise ValueError(
+            f"{path}: says {fps:g} frames a second; --in_fps {in_fps:g} is for files that say nothing, --fps resamples"
+        )

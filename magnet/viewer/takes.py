@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from magnet.body.base import Body, load_body
-from magnet.export.formats import read
+from magnet.export.formats import Reading, read
 from magnet.export.page.takes import SAMPLES, ShownTake, take, takes
 from magnet.export.trace import DenoisingTrace
 from magnet.files import load_npz
@@ -17,11 +17,15 @@ from magnet.motion.scene import Scene
 
 
 def read_takes(
-    paths: Sequence[str | Path], body: Body | None = None, context: int = 0, samples: int = SAMPLES
+    paths: Sequence[str | Path],
+    body: Body | None = None,
+    context: int = 0,
+    samples: int = SAMPLES,
+    in_fps: float | None = None,
 ) -> tuple[list[ShownTake], Body]:
     """The takes in several files, and their body.
 
-    body: the user's; by default the open one.
+    body: the user's; by default the open one. in_fps: frames a second of npz files that do not say it.
 
     Raises:
         FileNotFoundError: no such file.
@@ -30,7 +34,7 @@ def read_takes(
     body = body or load_body("open")
     found: list[tuple[Path, ShownTake]] = []
     for path in map(Path, paths):
-        scene, recording = read_scene(path, body)
+        scene, recording = read_scene(path, body, in_fps)
         here = takes(scene, path.stem, context, samples)
         if recording is not None:
             here = [take(path.stem, scene, context, recording)]
@@ -44,8 +48,10 @@ def read_takes(
     return [each for _, each in found], body
 
 
-def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
+def read_scene(path: Path, body: Body, in_fps: float | None = None) -> tuple[Scene, DenoisingTrace | None]:
     """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
+
+    in_fps: as for `read_takes`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -57,7 +63,7 @@ def read_scene(path: Path, body: Body) -> tuple[Scene, DenoisingTrace | None]:
             raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
         return recording.scene, recording
     try:
-        return read(path, body).scene, None
+        return read(path, body, Reading(in_fps=in_fps)).scene, None
     except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
 

@@ -202,6 +202,8 @@ def test_refine_refuses_what_means_nothing(
     "words, said",
     [
         (["--in_unit", "furlong"], "unit 'furlong' is for other programs' files"),
+        (["--in_fps", "25"], "says 30 frames a second; --in_fps 25 is for files that say nothing"),
+        (["--in_fps", "-1"], "in_fps"),
         (["--up", "q"], "up axis 'q' is for other programs' files"),
         (["--context", "-5"], "--context -5: expected 0 frames or more"),
         (["--context", "13"], "--context 13: got 12 frames, so at most 12 were given"),

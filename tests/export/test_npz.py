@@ -188,3 +188,52 @@ def test_lengths_in_centimetres_are_refused_until_they_are_called_so(tmp_path: P
 def test_turns_in_degrees_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"turns of up to .* radians; degrees"):
         read_smplx(scaled(tmp_path, radians=180 / np.pi), load_body())
+
+
+# -- keys of other programs --------------------------------------------------------------------
+
+
+def as_amass(a: dict) -> dict:
+    return {"poses": a["poses"], "trans": a["transl"], "mocap_framerate": 30.0}
+
+
+def as_smplx(a: dict) -> dict:
+    poses = a["poses"]
+    return {"global_orient": poses[:, :3], "body_pose": poses[:, 3:66], "transl": a["transl"], "fps": 30,
+            "betas": np.zeros((1, 10))}  # fmt: skip
+
+
+def as_interx(a: dict) -> dict:
+    poses = a["poses"]
+    return {"root_orient": poses[:, :3], "pose_body": poses[:, 3:66].reshape(-1, 21, 3), "trans": a["transl"]}
+
+
+def as_aist(a: dict) -> dict:
+    return {"smpl_poses": a["poses"][:, :72], "smpl_trans": 93 * a["transl"], "smpl_scaling": [93.0], "fps": 30}
+
+
+def as_matrices(a: dict) -> dict:
+    turned = roma.rotvec_to_rotmat(torch.from_numpy(a["poses"][:, :66].reshape(-1, 22, 3))).numpy()
+    return {"global_orient": turned[:, :1], "body_pose": turned[:, 1:], "transl": a["transl"], "fps": 30,
+            "betas": np.tile(a["betas"], (len(turned), 1))}  # fmt: skip
+
+
+@pytest.mark.parametrize("named", [as_amass, as_smplx, as_interx, as_aist, as_matrices])
+def test_every_naming_that_training_reads_shows_the_same_motion(named, trio: Scene, body: Body, tmp_path) -> None:
+    path = foreign(trio, body, tmp_path / "plain.npz", ())
+    wanted = load_smplx(path, body)
+    np.savez(tmp_path / "named.npz", **named(dict(np.load(path))))
+    fps = 30.0 if named is as_interx else None
+    back = read_smplx(tmp_path / "named.npz", body, in_fps=fps)[0]
+    assert back.fps == 30.0
+    assert (back.T_world_root - wanted.T_world_root).abs().max() < 1e-5
+    assert (back.body_rot - wanted.body_rot).abs().max() < 1e-5
+
+
+def test_a_file_without_a_rate_names_the_option_and_one_with_a_rate_keeps_it(trio: Scene, body: Body, tmp_path) -> None:
+    path = foreign(trio, body, tmp_path / "a.npz", ("mocap_frame_rate",))
+    with pytest.raises(ValueError, match=r"lacks mocap_frame_rate; it has .*--in_fps 30"):
+        load_smplx(path, body)
+    assert read_smplx(path, body, in_fps=25.0)[0].fps == 25.0
+    with pytest.raises(ValueError, match=r"says 30 frames a second; --in_fps 25 is for files that say nothing"):
+        read_smplx(foreign(trio, body, tmp_path / "b.npz", ()), body, in_fps=25.0)
