@@ -34,6 +34,8 @@ PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
 FILM = (640, 480)
 """Pixels of a film's panel."""
+UNSEEN = 0.0005
+"""Metres by which people are moved without a word."""
 
 
 @dataclass(frozen=True)
@@ -103,30 +105,37 @@ def read(
             way = "lowered" if imported.floor > 0 else "raised"
             notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
-    scenes, notes, foreign = [], [], False
+    scenes, notes, foreign = [], [], []
     for file in files:
         scene, note, strange = _read_npz(file, body, options)
         scenes.append(scene)
         notes += note
-        foreign |= strange
+        foreign.append(strange)
     if len(scenes) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
-        return _grounded(scene, body, notes, foreign and not options.keep_floor)
+        return _grounded(scene, body, notes, () if options.keep_floor else foreign)
     for file, scene in zip(files, scenes, strict=True):
         if scene.scenes != 1:
             raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
     labels = [str(file) for file in files]
     scene = together(scenes, labels, fps=options.fps, trim=options.trim)
-    return _grounded(scene, body, notes, foreign and not options.keep_floor)
+    return _grounded(scene, body, notes, () if options.keep_floor else foreign)
 
 
-def _grounded(scene: Scene, body: Body, notes: Sequence[str], moves: bool) -> Read:
-    """Put people on the floor if they are far from it and another program wrote the file."""
-    metres = level(scene, body)
-    if metres and moves:
-        way = "lowered" if metres > 0 else "raised"
-        notes = [*notes, f"everybody was {way} by {abs(metres):.2f} m onto the floor; --keep_floor leaves them"]
-        return Read(on_floor(scene, body), body, tuple(notes))
+def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[bool]) -> Read:
+    """Put the people of other programs' files onto the floor, which such files have at any height.
+
+    foreign: of each file, whether another program wrote it. Beside a file of ours, whose floor is known, people are
+    only moved where they are far from it; if there are none, nobody is.
+    """
+    if any(foreign) and (all(foreign) or level(scene, body)):
+        moved = on_floor(scene, body)
+        metres = float((scene.T_world_root - moved.T_world_root)[..., 1, 3].mean()) if scene.T_world_root.numel() else 0
+        if abs(metres) >= UNSEEN:
+            way = "lowered" if metres > 0 else "raised"
+            said = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
+            notes = [*notes, f"everybody was {way} by {said} onto the floor; --keep_floor leaves them"]
+        return Read(moved, body, tuple(notes))
     return Read(scene, body, (*notes, *_floor_note(scene, body)))
 
 

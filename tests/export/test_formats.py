@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 
 from magnet import cli
-from magnet.body import Body, load_body
+from magnet.body import Body, load_body, on_floor
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import formats, resampled
 from magnet.motion.scene import Scene
@@ -205,6 +205,18 @@ def test_another_programs_people_are_put_on_the_floor_and_ours_stay(duet: Scene,
             "m over y = 0, where models have their floor; `magnet export --on_floor` puts" in note
             for note in kept.notes
         )
+
+
+@pytest.mark.parametrize("off", [0.15, -0.15])
+def test_another_programs_people_are_put_on_the_floor_from_any_height(off: float, duet: Scene, body: Body, tmp_path):
+    T_world_root = on_floor(duet, body).T_world_root.clone()
+    T_world_root[..., 1, 3] += off - 2.0
+    theirs = upstairs(duet.replace(T_world_root=T_world_root), tmp_path / "a.npz", body, ours=False)
+    got = formats.read(theirs)
+    assert torch.allclose(on_floor(got.scene, body).T_world_root, got.scene.T_world_root, atol=1e-5)
+    kept = formats.read(theirs, options=formats.Reading(keep_floor=True)).scene
+    moved = float((kept.T_world_root - got.scene.T_world_root)[..., 1, 3].mean())
+    assert any(f"{'lowered' if moved > 0 else 'raised'} by {100 * abs(moved):.1f} cm" in note for note in got.notes)
 
 
 def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, tmp_path: Path):
