@@ -43,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     add("--fps", type=float, help="frames a second of OUT (default: as in IN)")
     add("--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it")
     add("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
+    add("--each", action="store_true", help="with --smplx, a file per person: out_0.npz ..., as most tools expect")
     add("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
     add = options.add_argument_group("bones of .glb, .fbx and .usd (defaults: smplx, floor, scene)").add_argument
     names = "SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's"
@@ -67,6 +68,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body import on_floor
     from magnet.export import formats
     from magnet.export.bones import BoneOptions
+    from magnet.export.npz import is_open
 
     out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size), not options.person)
     refuse_unused(options, out.suffix.lower())
@@ -90,8 +92,10 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(
             f"--context {options.context}: got {scene.frames} frames, so at most {scene.frames} were given"
         )
-    scene_files.require_unread(out, options.inputs, scene.present.sum(dim=1).tolist(), options.smplx)
+    scene_files.require_unread(out, options.inputs, scene.present.sum(dim=1).tolist(), options.smplx, options.each)
     print(described(scene))
+    if options.smplx and is_open(got.body):
+        print("shapes of the open body mean nothing to SMPL-X: betas are zero, and transl is that of its mean shape")
     written = formats.write(
         scene,
         out,
@@ -99,6 +103,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         fps=options.fps,
         unit=options.unit,
         smplx=options.smplx,
+        each=options.each,
         context_frames=options.context,
         style=options.style,
         title=options.title,
@@ -119,6 +124,8 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
     from magnet.export.formats import USD
 
     bones = (".glb", ".fbx", *USD)
+    if options.each and not options.smplx:
+        raise CommandError("--each: a file per person is for --smplx")
     for flag, plain, takes in (
         ("unit", "m", (".bvh",)),
         ("smplx", False, (".npz",)),

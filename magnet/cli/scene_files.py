@@ -100,27 +100,29 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
     return path
 
 
-def require_unread(path: Path, inputs: Sequence[str], people: Sequence[int], smplx: bool = False) -> None:
+def require_unread(
+    path: Path, inputs: Sequence[str], people: Sequence[int], smplx: bool = False, each: bool = False
+) -> None:
     """Refuse to write over an input that OUT does not name: people and scenes may get a file each.
 
     Args:
         path: OUT.
         inputs: files that are read.
         people: how many are there in each scene that is written.
-        smplx: as for `formats.write`.
+        smplx, each: as for `formats.write`.
 
     Raises:
         CommandError: names the input.
     """
     from magnet.export import formats
 
-    read = [each for each in map(Path, inputs) if each.exists()]
-    for file in formats.files_of(path, people, smplx):
+    read = [source for source in map(Path, inputs) if source.exists()]
+    for file in formats.files_of(path, people, smplx, each):
         named = file == path or (path.exists() and file.exists() and file.samefile(path))
-        for each in read if file.exists() and not named else ():
-            if file.samefile(each):
+        for source in read if file.exists() and not named else ():
+            if file.samefile(source):
                 raise CommandError(
-                    f"{path}: people and scenes get a {path.suffix.lower()} each, and {each.name}, which is read, "
+                    f"{path}: people and scenes get a {path.suffix.lower()} each, and {source.name}, which is read, "
                     "would be one of them; give OUT another name"
                 )
 

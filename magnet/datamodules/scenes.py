@@ -18,7 +18,19 @@ from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.registry import register_reader
-from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, SHAPE, WHOLE, posed, rotations
+from magnet.export.smpl_keys import (
+    BODY,
+    ORIENT,
+    OWN_SHAPE,
+    PLACE,
+    RATE,
+    SCALE,
+    SHAPE,
+    SMPLX_PELVIS,
+    WHOLE,
+    posed,
+    rotations,
+)
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec, to_rotvec
 from magnet.motion.scene import Scene
@@ -154,7 +166,10 @@ class ScenesReader(OwnReader[PosedTrack]):
         places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3))
         if SCALE in held:
             places = places / floats(f"{where}: {SCALE}", np.ravel(held[SCALE])[:1], (1,))
-        betas = _first(where, held, SHAPE, None)
+        own = bool(_body_of(held)) and OWN_SHAPE in held  # transl is SMPL-X's, the shapes are the open body's
+        if own:
+            places = places + np.asarray(SMPLX_PELVIS)
+        betas = held[OWN_SHAPE] if own else _first(where, held, SHAPE, None)
         if not several:
             poses, places, betas = poses[None], places[None], None if betas is None else [betas]
         if betas is None:
@@ -172,6 +187,7 @@ class ScenesReader(OwnReader[PosedTrack]):
                 shapes_of="" if betas is None else FAMILIES.get(width, ""),
                 name=str(held.get(PERSON, "")),
                 body=_body_of(held),
+                at_pelvis=own,
                 valid=np.ones(poses.shape[1], dtype=bool),
                 gender=gender_of(_one_of(held.get("gender"), p)),
             )

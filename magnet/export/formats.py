@@ -18,7 +18,7 @@ from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
-from magnet.export.npz import read_smplx, require_rate, save_smplx
+from magnet.export.npz import each_of, read_smplx, require_rate, save_smplx
 from magnet.export.retarget import load_bvh, together
 from magnet.export.smpl_keys import posed
 from magnet.export.usd import require_usd, save_usd
@@ -196,6 +196,7 @@ class WriteOptions:
     progress: bool | Report
     bones: BoneOptions
     size: Size = FILM
+    each: bool = False
 
     @property
     def look(self) -> dict[str, Any]:
@@ -223,7 +224,7 @@ class Format:
 
 
 def _write_npz(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    return save_smplx(scene, path, o.body) if o.smplx else [scene.save(path)]
+    return save_smplx(scene, path, o.body, apart=o.each) if o.smplx else [scene.save(path)]
 
 
 def _write_page(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
@@ -298,6 +299,7 @@ def write(
     progress: bool | Report = False,
     bones: BoneOptions = BoneOptions(),
     size: Size = FILM,
+    each: bool = False,
 ) -> list[Path]:
     """Write a scene in the format of the path's suffix.
 
@@ -315,6 +317,7 @@ def write(
         progress: True for a bar while films are drawn, or a function called with (done, all).
         bones: names and hierarchy of bones in GLB, FBX and USD.
         size: pixels of a film's panel, width and height, even numbers.
+        each: with smplx, a file per person: out_0.npz, out_1.npz ...
 
     Returns:
         The paths written.
@@ -339,7 +342,7 @@ def write(
     if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
-    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size)
+    options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size, each)
     places = places_of(path, scene.scenes, smplx)
     if len(places) == 1:
         return list(kind.write(scene, path, options))
@@ -357,9 +360,11 @@ def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
     return [path.with_name(f"{path.stem}_scene{b}{path.suffix.lower()}") for b in range(scenes)]
 
 
-def files_of(path: Path, people: Sequence[int], smplx: bool = False) -> list[Path]:
+def files_of(path: Path, people: Sequence[int], smplx: bool = False, each: bool = False) -> list[Path]:
     """The files that `write` writes, known before there is a scene. people: how many are there in each scene"""
     places = places_of(path, len(people), smplx)
+    if smplx and each:
+        return [file for place, count in zip(places, people, strict=True) for file in each_of(place, count)]
     if path.suffix.lower() != ".bvh":
         return places
     return [file for place, count in zip(places, people, strict=True) for file in paths_of(place, count)]

@@ -12,7 +12,19 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.export.rig import UNITS, UP
-from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, SHAPE, WHOLE, first_of, rotations
+from magnet.export.smpl_keys import (
+    BODY,
+    ORIENT,
+    OWN_SHAPE,
+    PLACE,
+    RATE,
+    SCALE,
+    SHAPE,
+    SMPLX_PELVIS,
+    WHOLE,
+    first_of,
+    rotations,
+)
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -26,8 +38,9 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
 
     poses (P, T, 165) axis-angle in radians, fingers, jaw and eyes at rest; transl and its other name trans (P, T, 3) =
     pelvis - J0(betas), metres, y up; betas (P, 10); gender, mocap_frame_rate, surface_model_type. Beside these `body`
-    says which body model the betas belong to, and `given` (P, T), where the scene has it, what a model was given.
-    Only SMPL-X's own betas look right in SMPL-X tools.
+    says which body model the scene is of, and `given` (P, T), where the scene has it, what a model was given.
+    The open body's shapes mean nothing to SMPL-X: its betas are written as zero, J0 is that of SMPL-X's mean shape, so
+    that pelvises are right in SMPL-X's tools, and `body_betas` (P, 10) keeps the shapes for `read_smplx`.
 
     Args:
         apart: one file per person (path_0.npz, ...) without the axis P, as most tools expect.
@@ -47,9 +60,18 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     turned = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
     poses = torch.zeros(*turned.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)
     poses[..., : 3 * BODY_JOINTS] = to_rotvec(turned).flatten(-2).cpu()
-    rest_pelvis = body.rest_joints(scene.betas[0])[:, 0].double()
+    own = is_open(body)
+    rest_pelvis = _smplx_pelvis(T_world_root) if own else body.rest_joints(scene.betas[0])[:, 0].double()
     transl = (T_world_root[..., :3, 3] - rest_pelvis[:, None]).cpu().numpy()
-    arrays = {"poses": poses.numpy(), "transl": transl, "trans": transl, "betas": scene.betas[0].cpu().numpy()}
+    betas = scene.betas[0].cpu().numpy()
+    arrays = {
+        "poses": poses.numpy(),
+        "transl": transl,
+        "trans": transl,
+        "betas": np.zeros_like(betas) if own else betas,
+    }
+    if own:
+        arrays[OWN_SHAPE] = betas
     if scene.given is not None:
         arrays["given"] = scene.given[0].T.cpu().numpy()
     facts = {
@@ -65,10 +87,25 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     if not apart:
         save_npz(path, arrays | facts)
         return [path]
-    paths = [path.with_name(f"{path.stem}_{p}.npz") for p in range(scene.agents)]
+    paths = each_of(path, scene.agents)
     for p, each in enumerate(paths):
         save_npz(each, {key: value[p] for key, value in arrays.items()} | facts)
     return paths
+
+
+def each_of(path: Path, people: int) -> list[Path]:
+    """The files of so many people written apart: out_0.npz, out_1.npz ..."""
+    return [path.with_name(f"{path.stem}_{p}.npz") for p in range(people)]
+
+
+def is_open(body: Body) -> bool:
+    """Whether shapes of this body are not SMPL-X's."""
+    return body.id.startswith("open")
+
+
+def _smplx_pelvis(like: Tensor) -> Tensor:
+    """(1, 3), metres"""
+    return like.new_tensor([SMPLX_PELVIS])
 
 
 def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
@@ -84,7 +121,7 @@ def read_smplx(
     Also read: every name that `magnet.export.smpl_keys` knows (`trans`, `root_orient` and `pose_body`,
     `global_orient` and `body_pose`, ...), rotations as matrices or joint by joint, more or fewer than ten betas (the
     first ten count; the median where a person has several rows), no betas (zero). A file that does not name its body
-    is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise.
+    is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise, with SMPL-X's mean J0.
 
     Args:
         path: the file.
@@ -107,7 +144,8 @@ def read_smplx(
     arrays, fps, written_for, name = _read(Path(path), in_fps)
     if written_for is not None and written_for != body.id:
         raise ValueError(f"{path}: written for body {written_for!r}, but {body.id!r} was given")
-    poses, transl, betas = arrays["poses"], arrays["transl"], arrays["betas"]
+    poses, transl, betas = arrays["poses"], arrays["transl"], arrays.get(OWN_SHAPE, arrays["betas"])
+    of_smplx = OWN_SHAPE in arrays or (written_for is None and is_open(body))  # transl is, betas are not
     if poses.ndim == 2:
         poses, transl, betas = poses[None], transl[None], betas[None]
     if betas.ndim == 3 and betas.shape[1]:  # a row a frame, or one for all
@@ -118,11 +156,12 @@ def read_smplx(
         shapes = f"poses {tuple(poses.shape)}, transl {tuple(transl.shape)}, betas {tuple(betas.shape)}"
         raise ValueError(f"{path}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10)")
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
-    if written_for is None and body.id.startswith("open"):
+    if written_for is None and is_open(body):
         betas = torch.zeros_like(betas)
     _require_radians(path, poses)
     turned = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
-    pelvis = transl * UNITS[unit or "m"] + body.rest_joints(betas.float())[:, 0].double()[:, None]
+    rest_pelvis = _smplx_pelvis(transl) if of_smplx else body.rest_joints(betas.float())[:, 0].double()
+    pelvis = transl * UNITS[unit or "m"] + rest_pelvis[:, None]
     T_world_root = rigid(turned[:, :, 0], pelvis)
     if up is None:
         up = "y" if written_for is not None else _standing(T_world_root)
@@ -199,10 +238,11 @@ def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, s
             betas = np.zeros((*poses.shape[:-2], 10)) if shape is None else file[shape]
             written_for = str(file["body"]) if ours else None
             name = str(file["name"]) if "name" in there else ""
+            own = file[OWN_SHAPE] if written_for is not None and OWN_SHAPE in there else None
             given = file["given"] if written_for is not None and "given" in there else None
     except (OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    arrays = {"poses": poses, "transl": transl, "betas": betas}
+    arrays = {"poses": poses, "transl": transl, "betas": betas} | ({} if own is None else {OWN_SHAPE: own})
     bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
     if bad or not 0 < fps < float("inf"):
         raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")

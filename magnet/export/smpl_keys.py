@@ -19,6 +19,11 @@ PLACE = ("trans", "transl", "smpl_trans", "translation")
 RATE = ("mocap_frame_rate", "mocap_framerate", "fps", "framerate", "frame_rate")
 SHAPE = ("betas", "shape", "beta")
 """Keys that files may have for the same thing."""
+OWN_SHAPE = "body_betas"
+"""Our key for shapes of the open body, which SMPL-X's `betas` cannot hold."""
+SMPLX_PELVIS = (0.003, -0.351, 0.012)
+"""J0, the rest pelvis of SMPL-X's neutral body in its mean shape (J_regressor @ v_template), metres, to a millimetre.
+A file's transl is the pelvis without it."""
 SCALE = "smpl_scaling"
 """By which AIST++'s translations are to be divided."""
 

@@ -179,3 +179,19 @@ def test_a_file_without_scenes_is_named(tmp_path: Path, capsys):
     empty = random_scene(1, 8, 1, torch.Generator().manual_seed(0)).select([]).save(tmp_path / "none.npz")
     assert cli.main(["export", str(empty), str(tmp_path / "o.glb")]) == 2
     assert "none.npz: holds no scenes" in capsys.readouterr().err
+
+
+def test_smplx_of_the_open_body_says_what_is_written_and_each_gives_a_file_per_person(tmp_path: Path, capsys):
+    scene = random_scene(1, 8, 2, torch.Generator().manual_seed(1))
+    source, out = scene.save(tmp_path / "in.npz"), tmp_path / "out.npz"
+    assert cli.main(["export", str(source), str(out), "--smplx", "--each"]) == 0
+    assert "betas are zero" in capsys.readouterr().out
+    files = [tmp_path / "out_0.npz", tmp_path / "out_1.npz"]
+    assert all(np.load(file)["poses"].shape == (8, 165) for file in files) and not out.exists()
+    assert cli.main(["export", *map(str, files), str(out)]) == 0
+    back = Scene.load(out)
+    assert torch.equal(back.betas, scene.betas)
+    assert torch.equal(back.T_world_root[..., :3, 3], scene.T_world_root[..., :3, 3])
+    assert cli.main(["export", str(source), str(out), "--each"]) == 2
+    assert cli.main(["export", str(files[0]), str(tmp_path / "out.npz"), "--smplx", "--each"]) == 2
+    assert "would be one of them" in capsys.readouterr().err

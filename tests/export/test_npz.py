@@ -13,6 +13,7 @@ from magnet.body import Body, load_body
 from magnet.export import load_smplx, save_smplx
 from magnet.export.npz import read_smplx
 from magnet.export.rig import UP
+from magnet.export.smpl_keys import SMPLX_PELVIS
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 from magnet.testing import random_scene
@@ -30,15 +31,21 @@ def test_joints_return_within_a_tenth_of_a_millimetre(trio: Scene, body: Body, t
     assert (body.joints(back) - body.joints(trio)).abs().max() < 1e-4
 
 
-def test_keys_are_the_conventional_ones(trio: Scene, body: Body, tmp_path: Path) -> None:
-    """Read as another tool would: the root turns about the pelvis at rest, then transl is added."""
+@pytest.mark.parametrize("whose", ["open", "smplx"])
+def test_keys_are_the_conventional_ones(whose: str, trio: Scene, body: Body, tmp_path: Path) -> None:
+    """Read as another tool would: the root turns about SMPL-X's pelvis at rest, then transl is added."""
+    theirs = body.J_template + torch.tensor(SMPLX_PELVIS)
+    smplx = Body(**{**vars_of(body), "id": "smplx-neutral", "J_template": theirs})  # where SMPL-X's mean shape is
+    if whose == "smplx":
+        body, trio = smplx, trio.replace(body=smplx.id)
     rotation = pytest.importorskip("scipy.spatial.transform", reason="scipy is not installed").Rotation
     (path,) = save_smplx(trio, tmp_path / "trio.npz", body)
     with np.load(path, allow_pickle=False) as file:
         assert file["poses"].shape == (3, 20, 165)
         assert not file["poses"][..., 66:].any()
         assert (str(file["gender"]), float(file["mocap_frame_rate"]), str(file["body"])) == ("neutral", 30.0, trio.body)
-        rest = body.rest_joints(torch.from_numpy(file["betas"]))[:, 0].numpy()
+        assert file["betas"].any() == (whose == "smplx")
+        rest = smplx.rest_joints(torch.from_numpy(file["betas"]))[:, 0].numpy()
         pelvis = rest[:, None] + file["transl"]
         turned = rotation.from_rotvec(file["poses"][..., :3].reshape(-1, 3)).as_matrix().reshape(3, 20, 3, 3)
         knee = rotation.from_rotvec(file["poses"][..., 12:15].reshape(-1, 3)).as_matrix().reshape(3, 20, 3, 3)
@@ -55,6 +62,18 @@ def test_one_file_a_person_holds_that_person(trio: Scene, body: Body, tmp_path: 
     back = load_smplx(paths[1], body)
     assert back.agents == 1
     assert (body.joints(back) - body.joints(trio)[:, :, 2:]).abs().max() < 1e-4
+
+
+def test_shapes_and_places_of_the_open_body_come_back_as_they_were(trio: Scene, body: Body, tmp_path: Path) -> None:
+    (path,) = save_smplx(trio, tmp_path / "trio.npz", body)
+    back = load_smplx(path, body)
+    assert torch.equal(back.betas, trio.betas)
+    assert torch.equal(back.T_world_root[..., :3, 3], trio.T_world_root[..., :3, 3])
+    with np.load(path) as file:  # as they were written before `body_betas`
+        old = {key: file[key] for key in file.files if key != "body_betas"} | {"betas": file["body_betas"]}
+    place = trio.T_world_root[0, :, :, :3, 3].transpose(0, 1).double().numpy()
+    np.savez(tmp_path / "old.npz", **{**old, "transl": place, "trans": place})
+    assert torch.equal(load_smplx(tmp_path / "old.npz", body).T_world_root, back.T_world_root)
 
 
 @pytest.mark.parametrize("apart", [False, True])
@@ -124,7 +143,7 @@ def test_a_file_of_another_program_is_turned_upright_whichever_axis_points_up(up
     with np.load(path) as file:
         arrays = dict(file)
     root = roma.rotvec_to_rotmat(torch.from_numpy(arrays["poses"][:, :3])).numpy()
-    rest = body.rest_joints(torch.zeros(10))[0].double().numpy()
+    rest = np.array(SMPLX_PELVIS)  # which turns with the world, unlike transl
     turned = roma.rotmat_to_rotvec(torch.from_numpy(turn[:3, :3] @ root)).numpy()
     place = (arrays["transl"] + rest) @ turn[:3, :3].T - rest
     poses = np.concatenate([turned, arrays["poses"][:, 3:]], axis=1)
