@@ -153,4 +153,8 @@ def _number(value: object) -> float:
 def _text(value: object) -> str:
     if not isinstance(value, str) or len(value) > LONGEST:
         raise RefusedMessage("header")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:  # half of a surrogate pair: JSON may hold it, UTF-8 does not
+        raise RefusedMessage("header") from error
     return value

@@ -64,6 +64,7 @@ WRONG = {
         changed(heard="A"), changed(heard=[1]), changed(sender=3), changed(model="f" * 65), changed(clock=10**400),
         sealed([b"magnet/B", b"[" * 2000, b"", b""]), sealed([b"magnet/B", b"\xff{}", b"", b""]),
         changed(betas=[float("nan")] * 10), sealed([b"magnet/B", b"7", b"", b""]),
+        changed(sender="\ud800"), changed(agent="\udfff"), changed(model="\ud800"), changed(heard=["B\ud800"]),
     ],
     "kind": [changed(kind="order"), changed(kind="hello"), changed(count=0), changed(kind=["frames"])],
     "topic": [changed(sender="A"), changed(sender="")],
@@ -116,6 +117,9 @@ def test_of_ten_thousand_broken_messages_none_is_taken_and_none_harms():
             if draw.random() < 0.5:
                 body[1] = bytes(draw.choice(b'"{}[]:,0-9eE.') if draw.random() < 0.05 else byte for byte in whole[1])
                 body[2] = draw.randbytes(draw.randrange(2000))
+                if draw.random() < 0.2:  # any letter that JSON can spell, half a surrogate pair among them
+                    letter = f'"\\u{draw.randrange(0x10000):04x}"'.encode()
+                    body[1] = whole[1].replace(b'"B"', letter, draw.randint(1, 2))
             parts = sealed(body)
         if kind < 3 and parts:
             parts[place] = bytes(part)
