@@ -19,8 +19,9 @@ from magnet.body import Body
 from magnet.datamodules.base import MotionDataModule
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import occupied
-from magnet.metrics import NearestTraining, all_metrics, columns_of, ground_truth_metrics
+from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
 from magnet.metrics.interval import Unit, independent_units
+from magnet.metrics.registry import MEMORISATION
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -74,9 +75,6 @@ MAX_WINDOWS = 1500
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""
-
-AGAINST_RECORDING = ("mpj", "hand_contact_")
-"""Numbers that compare a sample with the recording of its own scene, by how their names begin."""
 
 
 def planned(
@@ -166,7 +164,7 @@ class Scoring:
                 nearest = NearestTraining(
                     self.windows, of="truth" if name == TRUTH else "generated", confidence=CONFIDENCE
                 )
-                metrics[name].add_metrics({"memorisation": nearest})
+                metrics[name].add_metrics({MEMORISATION: nearest})
         return {name: each.to(self.device) for name, each in metrics.items()}
 
     def _read_test_scenes(self, datamodule: MotionDataModule, interval: Unit) -> None:
@@ -270,16 +268,16 @@ class Scoring:
     def finish(self, facts: dict[str, Any]) -> Results:
         """The table of all methods, with how it came about."""
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
-        strangers: dict[str, tuple[str, ...]] = {
-            TRAINING: (*AGAINST_RECORDING, "div")
-        }  # these are not of the scene that was recorded
+        columns = columns_of(*self.metrics.values())
+        strangers: dict[str, tuple[Beside, ...]] = {TRAINING: ("recording", "samples")}  # not of the recorded scene
         if self.nothing_is_given:
-            strangers |= dict.fromkeys(self.given_methods, AGAINST_RECORDING)
+            strangers |= dict.fromkeys(self.given_methods, ("recording",))
         for name, without in strangers.items():
-            rows[name] = {key: value for key, value in rows.get(name, {}).items() if not key.startswith(without)}
+            row = rows.get(name, {})
+            rows[name] = {key: value for key, value in row.items() if beside(key, columns) not in without}
         rows = {name: row for name, row in rows.items() if row}
         seconds = {name: round(value, 2) for name, value in self.seconds.items()}
-        return Results(rows, facts | {"seconds": seconds}, columns_of(*self.metrics.values()))
+        return Results(rows, facts | {"seconds": seconds}, columns)
 
 
 def generators_of(

@@ -11,7 +11,7 @@ from magnet.body.contact import hand_distance, penetration_depth, segment_distan
 from magnet.body.energy import hand_points
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.body_depth import BodyDepth
-from magnet.metrics.columns import Better, Column, column, columns_of
+from magnet.metrics.columns import Beside, Better, Column, beside, column, columns_of
 from magnet.metrics.diversity import Diversity, diversity
 from magnet.metrics.floor import Down, Floating, GroundPenetration, lowest_foot
 from magnet.metrics.frechet import FrechetBySecond, FrechetDistance, frechet_distance
@@ -30,6 +30,7 @@ from magnet.metrics.token_borders import TokenBorders
 from magnet.motion.scene import FPS
 
 __all__ = [
+    "Beside",
     "Better",
     "BodyDepth",
     "ClipMeans",
@@ -57,6 +58,7 @@ __all__ = [
     "VelocityError",
     "all_metrics",
     "bearing",
+    "beside",
     "bootstrap_interval",
     "column",
     "columns_of",
@@ -89,8 +91,9 @@ def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: floa
             between keyframes; None: everything. `update(..., agents=...)` says it for one batch instead.
         confidence: such as 0.95, for metrics that are means over clips; adds `_low` and `_high`.
     """
+    ours = _ours(fps, scored, confidence)  # made first: it refuses what no metric takes
     others = other_metrics(_ours, "generated", scored, fps, confidence)
-    return MetricCollection({**_ours(fps, scored, confidence), **others}, compute_groups=False)
+    return MetricCollection({**ours, **others}, compute_groups=False)
 
 
 def ground_truth_metrics(
@@ -100,8 +103,9 @@ def ground_truth_metrics(
 
     Fed like `all_metrics`; what is generated is not read.
     """
+    ours = _of_motion(fps, "truth", scored, confidence)
     others = other_metrics(_ours, "truth", scored, fps, confidence)
-    return MetricCollection({**_of_motion(fps, "truth", scored, confidence), **others}, compute_groups=False)
+    return MetricCollection({**ours, **others}, compute_groups=False)
 
 
 def _ours(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> dict[str, Metric]:

@@ -11,6 +11,9 @@ from torchmetrics import Metric, MetricCollection
 Better = Literal["low", "high", "real", ""]
 """Which value is good: a low one, a high one, or one near the recorded motion's own; "" says nothing."""
 
+Beside = Literal["recording", "samples", ""]
+"""What a sample is compared with: the recording of its own scene, the other samples of that scene, or neither."""
+
 
 class Column(NamedTuple):
     """Title, unit, direction and meaning of one number.
@@ -21,6 +24,8 @@ class Column(NamedTuple):
         better: which value is good.
         meaning: what is measured, in a few words for the footnote.
         main: whether the short table shows it.
+        beside: what a sample is compared with. Rows whose samples are not of the recorded scene, such as the training
+            set's, leave out what they cannot be compared with.
     """
 
     title: str
@@ -28,6 +33,7 @@ class Column(NamedTuple):
     better: Better
     meaning: str
     main: bool = False
+    beside: Beside = ""
 
 
 class Part(NamedTuple):
@@ -76,6 +82,11 @@ def column(name: str, known: Mapping[str, Column]) -> Column:
     else:
         title = meaning = part
     return whole._replace(title=f"{whole.title} {title}", meaning=f"{whole.meaning}, {meaning}", main=False)
+
+
+def beside(name: str, known: Mapping[str, Column]) -> Beside:
+    """What a number compares a sample with; a part and an end of an interval as the number itself does."""
+    return column(name if name in known else re.sub("_(low|high)$", "", name), known).beside
 
 
 def part_notes(names: Iterable[str]) -> list[str]:

@@ -40,7 +40,7 @@ class Diversity(ClipMeans):
 
     higher_is_better = True
     columns: ClassVar[Mapping[str, Column]] = {
-        "div": Column("DIV", "m²", "high", "variance over the samples of a scene", main=True)
+        "div": Column("DIV", "m²", "high", "variance over the samples of a scene", main=True, beside="samples")
     }
 
     def measure(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:

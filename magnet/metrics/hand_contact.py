@@ -58,8 +58,12 @@ class HandContact(ClipMeans):
 
     columns: ClassVar[Mapping[str, Column]] = {
         "hand_contact": Column("hands", "", "real", "share of frames with hands of two people in contact", main=True),
-        "hand_contact_precision": Column("hands right", "", "high", "share of hand contact that was recorded too"),
-        "hand_contact_recall": Column("hands met", "", "high", "share of recorded hand contact that is met"),
+        "hand_contact_precision": Column(
+            "hands right", "", "high", "share of hand contact that was recorded too", beside="recording"
+        ),
+        "hand_contact_recall": Column(
+            "hands met", "", "high", "share of recorded hand contact that is met", beside="recording"
+        ),
         "hand_hold": Column("hold", "s", "real", "how long hands hold"),
         "hand_hold_long": Column("long holds", "", "real", "share of hand contact in holds over 1 s"),
     }

@@ -46,11 +46,13 @@ class PositionError(ClipMeans):
 
     higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
-        "mpjpe": Column("MPJPE", "m", "low", MEANING),
-        "mpjpe@1s": Column("MPJPE 1s", "m", "low", f"{MEANING}, up to 1 s", main=True),
-        "mpjpe_best": Column("MPJPE best", "m", "low", "distance to the recorded joints, best sample"),
-        "mpjpe_mean": Column("MPJPE mean", "m", "low", OF_MEAN),
-        "mpjpe_mean@1s": Column("MPJPE mean 1s", "m", "low", f"{OF_MEAN}, up to 1 s", main=True),
+        "mpjpe": Column("MPJPE", "m", "low", MEANING, beside="recording"),
+        "mpjpe@1s": Column("MPJPE 1s", "m", "low", f"{MEANING}, up to 1 s", main=True, beside="recording"),
+        "mpjpe_best": Column(
+            "MPJPE best", "m", "low", "distance to the recorded joints, best sample", beside="recording"
+        ),
+        "mpjpe_mean": Column("MPJPE mean", "m", "low", OF_MEAN, beside="recording"),
+        "mpjpe_mean@1s": Column("MPJPE mean 1s", "m", "low", f"{OF_MEAN}, up to 1 s", main=True, beside="recording"),
     }
 
     def __init__(self, fps: float = FPS, seconds: Sequence[float] = (0.5, 1.0, 2.0, 5.0), **kwargs: Any) -> None:
@@ -105,7 +107,7 @@ class VelocityError(ClipMeans):
 
     higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
-        "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities")
+        "mpjve": Column("MPJVE", "m/frame", "low", "distance to the recorded joints' velocities", beside="recording")
     }
 
     def __init__(self, fps: float = FPS, per_second: bool = False, **kwargs: Any) -> None:

@@ -11,8 +11,11 @@ from torchmetrics import Metric
 
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.columns import columns_of
+from magnet.metrics.memorisation import NearestTraining
 from magnet.plugins import Registry
 
+MEMORISATION = "memorisation"
+"""Name of the metric NearestTraining, which needs a training set and so is measured apart from the others."""
 TAKEN: set[str] = set()
 """Names of our metrics and of their numbers."""
 
@@ -42,7 +45,7 @@ METRICS = Registry("metric", "magnet.metrics", (), _check)
 def other_metrics(
     ours: Callable[[], Mapping[str, Metric]], of: Of, agents: Tensor | None, fps: float, confidence: float | None
 ) -> dict[str, Metric]:
-    """Metrics of installed packages, by name; those that fail to load are left out, with a warning.
+    """Metrics of installed packages, by name; those that fail to load or to be made are left out, with a warning.
 
     Args:
         ours: makes our metrics, whose names nothing else may have.
@@ -51,12 +54,17 @@ def other_metrics(
     """
     if not METRICS.discovered:
         known = ours()
-        TAKEN.update(known, columns_of(*known.values()))
+        TAKEN.update(known, columns_of(*known.values()), [MEMORISATION], NearestTraining.columns)
         METRICS.discover()
         for name, error in METRICS.failed.items():
             warnings.warn(f"metric {name} is left out, it failed to load: {error}", stacklevel=2)
     made: dict[str, Metric] = {}
     for name, each in sorted(METRICS.known.items()):
         means: dict[str, Any] = {"confidence": confidence} if issubclass(each.kind, ClipMeans) else {}
-        made[name] = each.kind(of=of, agents=agents, fps=fps, **means)
+        try:
+            made[name] = each.kind(of=of, agents=agents, fps=fps, **means)
+        except Exception as error:  # a stranger's class may raise anything
+            METRICS.failed[name] = error
+            del METRICS.known[name]
+            warnings.warn(f"metric {name} is left out, it cannot be made: {error}", stacklevel=2)
     return made

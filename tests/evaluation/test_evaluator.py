@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import ClassVar
 
 import lightning as L
 import pytest
@@ -8,8 +9,12 @@ import torch
 from magnet.datamodules.options import HeldOutScenes
 from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluator, aligned
 from magnet.evaluation.results import Results
+from magnet.metrics import ClipMeans, Column, beside
+from magnet.metrics.base import clip_sums
+from magnet.metrics.registry import METRICS
 from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.scene import Scene, concatenate
+from magnet.plugins import Registered
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
@@ -58,18 +63,43 @@ def answered() -> tuple[Scene, Evaluator]:
 
 def test_every_method_is_measured_on_the_same_scenes(measured):
     results = measured
+    memorisation = {f"nearest_training{end}" for end in ("", "_low", "_high")}
     answering = {MODEL, "NN", "RS", "zero velocity", "ridge", "NN, not aligned", "RS, not aligned"}
     assert set(results.rows) == answering | {TRUTH, TRAINING}
     for method in answering:
         assert {"fd", "mi", "fs", "ip_ratio", "mpjpe", "mpjve", "mpjpe@0.5s"} <= set(results.rows[method])
     assert {"fd", "fd_pair", "fs", "ip_ratio"} <= set(results.rows[TRAINING])
-    assert not {name for name in results.rows[TRAINING] if name.startswith(("mpj", "div"))}
+    compared = {name for name in results.rows[MODEL] if beside(name, results.columns)}
+    assert {"mpjpe", "mpjpe@0.5s", "mpjve", "div"} <= compared
+    assert results.rows[TRAINING].keys() == results.rows[MODEL].keys() - compared - memorisation
     assert results.rows[MODEL]["div"] > 0
     for method in ("NN", "zero velocity", "ridge"):
         assert results.rows[method]["div"] == 0
     assert {method for method, row in results.rows.items() if "nearest_training" in row} == {MODEL, TRUTH}
     assert results.rows["ridge"]["mpjpe"] < results.rows["zero velocity"]["mpjpe"]
     assert results.meta["test scenes"] == 9
+
+
+class Divergence(ClipMeans):
+    columns: ClassVar = {
+        "divergence": Column("divergence", "m", "real", "how high heads are, called much like DIV"),
+        "mpj_count": Column("joints", "", "", "the same, called much like MPJPE"),
+        "miss": Column("miss", "m", "low", "the same, of a recording", beside="recording"),
+        "spread": Column("spread", "m", "", "the same, of samples", beside="samples"),
+    }
+
+    def measure(self, futures):
+        return [clip_sums(futures.generated[..., 15, 1], futures.scored)] * 4
+
+
+def test_the_training_sets_row_leaves_out_what_columns_say_and_nothing_by_its_name(monkeypatch):
+    monkeypatch.setattr(METRICS, "discovered", True)
+    monkeypatch.setattr(METRICS, "known", {"divergence": Registered("divergence", Divergence, "a plug-in")})
+    monkeypatch.setattr("magnet.evaluation.scoring.Scoring._baselines", lambda *_: {})
+    rows = run(data(), task=registry.get("generation")()).results.rows
+    own = {row: set(Divergence.columns) & rows[row].keys() for row in rows}
+    everything = set(Divergence.columns)
+    assert own == {MODEL: everything - {"miss"}, TRAINING: {"divergence", "mpj_count"}, TRUTH: everything}
 
 
 def test_a_training_stretch_met_again_is_found_by_nearest_neighbour():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from typing import ClassVar
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 from magnet import plugins
+from magnet.evaluation.results import Results, own_columns
 from magnet.metrics import ClipMeans, Column, MotionMetric, all_metrics, columns_of, ground_truth_metrics
 from magnet.metrics.base import clip_sums
 from magnet.metrics.registry import METRICS
@@ -53,6 +55,17 @@ class Bound(Heads):
     columns: ClassVar = {"fs_low": Column("mine", "m", "low", "a bound of ours")}
 
 
+class Nearest(Heads):
+    columns: ClassVar = {"nearest_training": Column("mine", "m", "low", "a number that only a training set gives")}
+
+
+class Unmade(Heads):
+    columns: ClassVar = {"unmade": Column("unmade", "m", "low", "of a class that asks for more")}
+
+    def __init__(self, needed, **kwargs):
+        super().__init__(**kwargs)
+
+
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     points = {
@@ -64,19 +77,24 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "bound": "Bound",
         "gone": "Gone",
         "FS": "Heads",
+        "nearest": "Nearest",
+        "memorisation": "Heads",
+        "unmade": "Unmade",
     }
     found = [EntryPoint(name, f"{__name__}:{kind}", "magnet.metrics") for name, kind in points.items()]
     monkeypatch.setattr(plugins, "entry_points", lambda group: found if group == "magnet.metrics" else [])
     for field, fresh in (("known", {}), ("failed", {}), ("discovered", False)):
         monkeypatch.setattr(METRICS, field, fresh)
     yield
+    own_columns.cache_clear()
 
 
 def test_they_are_measured_of_samples_and_of_recordings(installed: None) -> None:
     generated, truth, present = draw_batch()
     with pytest.warns(UserWarning, match="metric .* is left out, it failed to load") as warned:
         made = all_metrics(confidence=0.95)
-    assert {str(each.message).split()[1] for each in warned} == {"nameless", "mine", "variant", "bound", "gone", "FS"}
+    left_out = {"nameless", "mine", "variant", "bound", "gone", "FS", "nearest", "memorisation", "unmade"}
+    assert {str(each.message).split()[1] for each in warned} == left_out == METRICS.failed.keys()
     recorded = ground_truth_metrics()
     for metrics in (made, recorded):
         metrics.update(generated, truth, present)
@@ -86,6 +104,33 @@ def test_they_are_measured_of_samples_and_of_recordings(installed: None) -> None
     assert made.compute()["calls"] == 1
     assert columns_of(made)["head_height"].main
     assert "mine" not in made and "fs" in made.compute()
+
+
+@pytest.mark.filterwarnings("ignore:metric .* is left out, it failed")
+def test_one_that_cannot_be_made_is_named_once_and_in_nobodys_way(installed: None) -> None:
+    own_columns.cache_clear()
+    with pytest.warns(UserWarning, match="metric unmade is left out, it cannot be made: .*needed"):
+        assert "| FD ↓ |" in Results({"a": {"fd": 1.0}, "b": {"fd": 2.0}}).to_markdown()
+    own_columns.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "heads" in all_metrics() and "unmade" not in ground_truth_metrics()
+
+
+@pytest.mark.filterwarnings("ignore:metric .* is left out")
+def test_what_no_metric_takes_is_not_blamed_on_a_plug_in(installed: None) -> None:
+    all_metrics()
+    for make in (all_metrics, ground_truth_metrics):
+        with pytest.raises(ValueError, match="fps"):
+            make(fps=0)
+    assert "heads" in all_metrics()
+
+
+@pytest.mark.filterwarnings("ignore:metric .* is left out")
+def test_names_of_what_a_training_set_gives_are_taken(installed: None) -> None:
+    all_metrics()
+    assert "something called nearest_training is measured already" in str(METRICS.failed["nearest"])
+    assert "something called memorisation is measured already" in str(METRICS.failed["memorisation"])
 
 
 def test_nothing_is_added_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
