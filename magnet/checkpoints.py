@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import re
+import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from magnet.files import file_hash, inside, write_whole
+from magnet.files import file_hash, inside, sync, write_whole, writing
 from magnet.old_names import renamed_checkpoint
 
 FOLDER = Path(__file__).parent / "weights"
@@ -227,48 +228,60 @@ def _config_hash(config: dict[str, Any]) -> str:
 
 
 def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None = None, half: bool = True) -> Path:
-    """Release a checkpoint as a folder.
+    """Release a checkpoint as a folder; one that was there before stays whole until all of this one is on the disk.
 
     Args:
         checkpoint: as Lightning saved it.
         folder: made if missing; older parts in it are removed.
         about: what the model was trained on, and how, for config.json.
         half: keep two-dimensional and larger weights in float16; statistics stay as they are.
+
+    Raises:
+        CannotWrite: the disk is full, or the folder may not be written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.glob("*.safetensors"):
-        old.unlink()
+    advice = "choose another folder"
+    with writing(folder, advice), tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as name:
+        aside, listed = Path(name), []
+        for number, part in enumerate(_in_parts(checkpoint["state_dict"], half), 1):
+            file = aside / f"weights-{number:02d}.safetensors"
+            save_file(part, file)
+            sync(file)
+            listed.append({"file": file.name, "sha256": file_hash(file)})
+        config = {
+            "format": FORMAT,
+            "steps": int(checkpoint.get("global_step", 0)),
+            "parts": listed,
+            **{name: checkpoint.get(name) for name in KEPT},
+            "about": about or {},
+        }
+        config = json.loads(json.dumps(config, default=str))  # as it will be read
+        text = json.dumps(config | {"sha256": _config_hash(config)}, indent=1) + "\n"
+        write_whole(aside, "config.json", text.encode(), advice=advice)
+        new = [*(part["file"] for part in listed), "config.json"]
+        for each in new:  # what is left are renames, which need no space
+            os.replace(aside / each, folder / each)
+        for old in {path.name for path in folder.glob("*.safetensors")} - set(new):
+            (folder / old).unlink()
+    sync(folder)
+    return folder
+
+
+def _in_parts(state: dict[str, Tensor], half: bool) -> list[dict[str, Tensor]]:
+    """Weights as they are released, in parts of at most `PART_BYTES` or of one tensor."""
     exact = ("statistics", "mean", "std")
-    state = {
-        name: value.half()
-        if half and value.is_floating_point() and value.dim() > 1 and not any(part in name for part in exact)
-        else value
-        for name, value in checkpoint["state_dict"].items()
-    }
     parts: list[dict[str, Tensor]] = [{}]
     size = 0
     for name, value in state.items():
+        if half and value.is_floating_point() and value.dim() > 1 and not any(part in name for part in exact):
+            value = value.half()
         weight = value.numel() * value.element_size()
         if parts[-1] and size + weight > PART_BYTES:
             parts.append({})
             size = 0
         parts[-1][name] = value.contiguous()
         size += weight
-    listed = []
-    for number, part in enumerate(parts, 1):
-        file = folder / f"weights-{number:02d}.safetensors"
-        save_file(part, file)
-        listed.append({"file": file.name, "sha256": file_hash(file)})
-    config = {
-        "format": FORMAT,
-        "steps": int(checkpoint.get("global_step", 0)),
-        "parts": listed,
-        **{name: checkpoint.get(name) for name in KEPT},
-        "about": about or {},
-    }
-    config = json.loads(json.dumps(config, default=str))  # as it will be read
-    (folder / "config.json").write_text(json.dumps(config | {"sha256": _config_hash(config)}, indent=1) + "\n")
-    return folder
+    return parts
 
 
 REQUEUED = "hpc_ckpt_"

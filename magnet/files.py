@@ -155,9 +155,9 @@ def write_whole(
     return called, digest
 
 
-def sync(folder: Path) -> None:
-    """Write renames in a folder to the disk."""
-    handle = os.open(folder, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Write a file, or the renames in a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

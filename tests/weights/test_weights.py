@@ -1,4 +1,6 @@
+import errno
 import json
+import math
 import pickle
 from pathlib import Path
 
@@ -6,6 +8,7 @@ import pytest
 import torch
 
 from magnet import checkpoints
+from magnet.files import CannotWrite
 from magnet.training.checkpoint_io import CheckpointIO
 from tests.scripts import module_at
 
@@ -51,6 +54,40 @@ def test_no_part_is_larger_than_the_limit(checkpoint, tmp_path, monkeypatch):
     assert len(parts) > 1
     assert all(part.stat().st_size < 12_000 for part in parts)
     assert len(checkpoints.read(folder)["state_dict"]) == 9
+
+
+def whole(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("full", range(3), ids=["first part", "second part", "config.json"])
+def test_a_release_that_was_there_stays_whole_where_the_new_one_is_not(checkpoint, tmp_path, monkeypatch, full):
+    folder = checkpoints.write(checkpoint, tmp_path / "m")
+    (folder / "README.md").write_text("a card")
+    before = whole(folder)
+    monkeypatch.setattr(checkpoints, "PART_BYTES", 10_000)  # two parts
+    other = {**checkpoint, "state_dict": {str(i): torch.randn(50, 40) for i in range(4)}}
+    save_file, write_whole, written = checkpoints.save_file, checkpoints.write_whole, []
+
+    def write(real):
+        def until_the_disk_is_full(*args, **kwargs):
+            written.append(args)
+            if len(written) > full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(*args, **kwargs)
+
+        return until_the_disk_is_full
+
+    monkeypatch.setattr(checkpoints, "save_file", write(save_file))
+    monkeypatch.setattr(checkpoints, "write_whole", write(write_whole))
+    with pytest.raises(CannotWrite, match="the disk is full"):
+        checkpoints.write(other, folder)
+    assert len(written) == full + 1 and whole(folder) == before
+    full = math.inf
+    assert len(checkpoints.read(checkpoints.write(other, folder))["state_dict"]) == 4
+    monkeypatch.undo()
+    checkpoints.write(checkpoint, folder)
+    assert whole(folder).keys() == {"README.md", "config.json", "weights-01.safetensors"}
 
 
 def test_a_damaged_part_is_named(checkpoint, tmp_path):
