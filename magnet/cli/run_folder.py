@@ -258,6 +258,18 @@ def clock(seconds: float) -> str:
     return f"{hour}:{minute:02}:{second:02}"
 
 
+def seeds(options: dict[str, Any]) -> dict[str, Any]:
+    """What a run's randomness follows from, for its record: the main seed, and every one by the option that sets it.
+
+    Samples follow from `seed`, where a command has it, batches from `data.seed`, noise in training from `model.seed`.
+    """
+    found = {name: options.get(name) for name in ("seed", "seed_everything")}
+    for part in ("model", "data"):
+        found[f"{part}.seed"] = ((options.get(part) or {}).get("init_args") or {}).get("seed")
+    known = {name: seed for name, seed in found.items() if seed is not None}
+    return {"seed": known.get("seed", options.get("seed_everything")), "seeds": known}
+
+
 class Record(Callback):
     """Writes the configuration and where the run came from, and puts the options into every checkpoint.
 

@@ -300,10 +300,8 @@ class MagnetCLI(LightningCLI):
         self._dump_config()
         options = {key: self.config_dump.get(key) for key in ("model", "data")}
         config = self._parser(self.command).dump(self.config[self.command], skip_none=False)
-        facts = {
-            "seed": self._option("seed_everything"),
-            "checkpoint": None if self.checkpoint is None else str(self.checkpoint),
-        }
+        facts = run_folder.seeds(self.config_dump)
+        facts["checkpoint"] = None if self.checkpoint is None else str(self.checkpoint)
         latest = self.command == "fit" and self._option("out") is None
         return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on, self.command)
 

@@ -212,6 +212,7 @@ class Evaluator(L.LightningModule):
             "task": type(self.task).__name__,
             "task options": repr(self.task),
             "samples": self.samples,
+            "seed": self.seed,
             "sampler": repr(self.sampler.filled(self.denoiser.sampling)),
             "test scenes": self.scenes,
             "context frames": self.context,

@@ -16,7 +16,7 @@ import yaml
 from lightning.pytorch.trainer.connectors import checkpoint_connector
 
 from magnet import cli
-from magnet.cli import train
+from magnet.cli import run_folder, train
 from magnet.training.checkpoint_io import CheckpointIO
 from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel, play
 
@@ -189,6 +189,24 @@ def test_a_run_records_how_it_came_about(trained: Path) -> None:
     assert (trained / "metrics.csv").exists()
     checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
     assert checkpoint["magnet_config"]["data"]["init_args"]["takes"] == 7
+
+
+def test_a_run_records_the_seeds_that_it_used(sampling: Path, toy: Path) -> None:
+    words = ("--samples", "2", "--seed", "5", "--seed_everything", "6", "--out", "tested")
+    go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", *words)
+    facts = json.loads((toy / "tested" / "run.json").read_text())
+    assert facts["seed"] == ToyModel.seen["evaluator"].seed == 5
+    assert facts["seeds"] == {"seed": 5, "seed_everything": 6}  # neither the toy nor its data have one of their own
+
+
+def test_seeds_of_model_and_data_are_recorded_by_their_names() -> None:
+    of = {"class_path": "its.Class", "init_args": {"seed": 3}}
+    fit = run_folder.seeds({"seed_everything": 1111, "model": of, "data": {"class_path": "its.Data"}})
+    assert fit == {"seed": 1111, "seeds": {"seed_everything": 1111, "model.seed": 3}}
+    assert run_folder.seeds({"seed": 5, "seed_everything": 1, "model": None, "data": of}) == {
+        "seed": 5,
+        "seeds": {"seed": 5, "seed_everything": 1, "data.seed": 3},
+    }
 
 
 def test_the_configuration_of_a_run_repeats_it(trained: Path) -> None:
