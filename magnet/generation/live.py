@@ -166,6 +166,11 @@ class Live:
             self.version += 1
             return keep
 
+    def now(self) -> tuple[Scene, int]:
+        """The scene, and the version that it is of, together: another thread may begin or append meanwhile."""
+        with self.lock:
+            return self.scene, self.version
+
     @property
     def fps(self) -> float:
         """Frames made for each second of computing, so far."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from magnet.body.base import Body
 from magnet.export.page.rig import Array
-from magnet.export.page.takes import ShownTake, take
+from magnet.export.page.takes import take
 from magnet.generation.live import Live, LiveChunk
 from magnet.motion.scene import Scene
 from magnet.tasks import registry
@@ -94,14 +94,14 @@ class LiveApp(ViewerBase):
         super().__init__(body, render or RenderOptions(), host, port, "magnet live")
         self.live, self.examples = live, dict(examples or {})
         self.example = example or NOTHING
-        self.version = live.version
-        self.clock = Clock(live.scene.frames, live.scene.fps, growing=True, loop=False)
+        scene, self.version = live.now()
+        self.clock = Clock(scene.frames, scene.fps, growing=True, loop=False)
         self.worker = Worker(live, ahead, self._refused, self._made)
         self.refusal, self.news = "", ""
         self.again: int | None = None  # the frame to play from, once what has been made anew is on the stage
         self.casts: dict[tuple[float, ...], SceneView] = {}
         with self.server.atomic():
-            self._cast()
+            self._cast(scene)
             self.frame_all()
             add_guide(self.server)
             self.add_timeline()
@@ -118,36 +118,32 @@ class LiveApp(ViewerBase):
 
     # -- the growing scene ---------------------------------------------------------------------
 
-    def _take(self) -> ShownTake:
-        return take("", self.live.scene)
-
-    def _cast(self) -> None:
-        """Show the people of the scene, reusing meshes of people shown before."""
-        scene = self.live.scene
+    def _cast(self, scene: Scene) -> None:
+        """Show the people of a scene, reusing meshes of people shown before."""
         key = tuple(scene.betas.flatten().tolist())
         for view in self.views:
             view.set_visible(False)
         if key not in self.casts:
-            first = dataclasses.replace(self._take(), label=f"cast {len(self.casts)}")
+            first = take(f"cast {len(self.casts)}", scene)
             self.casts[key] = SceneView(self.server, "/stage", self.body, first, np.zeros(3), self.render, label=False)
         self.views = [self.casts[key]]
-        self.views[0].take = self._take()
+        self.views[0].take = take("", scene)
         self.views[0].set_style(self.render)
         self.views[0].set_visible(True)
 
     def before_draw(self) -> None:
         """Add what was generated in the meantime."""
         with self.lock:
-            scene = self.live.scene
-            if self.version != self.live.version:
-                self.version, self.shown = self.live.version, -1
+            scene, version = self.live.now()  # a scene of one moment: its people may be others at the next
+            if self.version != version:
+                self.version, self.shown = version, -1
                 self.clock.frames = scene.frames
                 self.clock.seek(min(self.clock.frame if self.again is None else self.again, scene.frames - 1))
                 self.again = None
                 self.slider.max = scene.frames - 1
-                self._cast()
+                self._cast(scene)
             if scene.frames != self.views[0].take.frames:
-                self.views[0].take = self._take()
+                self.views[0].take = take("", scene)
                 self.clock.frames = scene.frames
                 self.slider.max = scene.frames - 1
             self.worker.watch(self.clock.frame)
