@@ -1,7 +1,7 @@
-"""The energy of bodies together: depth, held hands, standing feet, floor, limits of joints, balance.
+"""The energy of bodies together: depth, standing feet that slide, soles under the floor, joints beyond their range.
 
-Each term is a function of points or rotations, batched, differentiable and in metres or radians. Which depth is contact
-and which is penetration depends on the parts that meet (`Contact`).
+Each term is a function of points or rotations, batched, differentiable and in metres or radians, or in their squares.
+Which depth is contact and which is penetration depends on the parts that meet (`Contact`).
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ from magnet.body.fitted_capsules import FOREARMS, HANDS, LEGS, PARTS, TRUNK, UPP
 from magnet.body.indices import indices
 
 from magnet.body.joints import (  # isort: skip
-    ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
+    ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
 )  # fmt: skip
 from magnet.motion.scene import BODY_JOINTS, FPS
 
 GRAVITY = 9.81
 BEYOND = 0.08
 """Metres from the wrist to the middle of the hand, along the forearm: bodies of 22 joints have no hands."""
-SOLE = 0.10
-"""Metres around the line between the feet that support a body: about half a foot's length."""
 
 
 @dataclass(frozen=True)
@@ -107,18 +105,6 @@ def hand_points(joints: Tensor, beyond: float = BEYOND) -> Tensor:
     return wrist + beyond * torch.nn.functional.normalize(wrist - elbow, dim=-1)
 
 
-def hold_error(joints: Tensor, partner: Tensor, between: Tensor, held: Tensor) -> Tensor:
-    """How far hands that held each other have moved apart. -> (..., 2, 2) metres
-
-    Args:
-        joints, partner: (..., 22, 3) in the world.
-        between: (..., 2, 2, 3) from each hand of the partner to each own hand, when they held.
-        held: (..., 2, 2) bool, which of them hold.
-    """
-    now = hand_points(joints)[..., :, None, :] - hand_points(partner)[..., None, :, :]
-    return torch.where(held, (now - between).square().sum(dim=-1).clamp_min(1e-12).sqrt(), 0.0)
-
-
 def slide(joints: Tensor, stands: Tensor, still: float = 0.05, fps: float = FPS) -> Tensor:
     """How much farther than allowed standing toes move over the floor in a frame, in metres.
 
@@ -131,12 +117,6 @@ def slide(joints: Tensor, stands: Tensor, still: float = 0.05, fps: float = FPS)
 def under_floor(joints: Tensor, clearance: Tensor) -> Tensor:
     """Depth of soles under y = 0. joints (..., P, 22, 3), clearance (..., P, 4) of `FEET` -> (..., P, 4) metres"""
     return (clearance - joints[..., ANKLES + TOES, 1]).clamp_min(0)
-
-
-def over_floor(joints: Tensor, clearance: Tensor, floats: Tensor) -> Tensor:
-    """Height of the lower foot of those who float over y = 0. floats (..., P) bool -> (..., P) metres"""
-    height = (joints[..., ANKLES + TOES, 1] - clearance).amin(dim=-1)
-    return torch.where(floats, height.clamp_min(0), 0.0)
 
 
 TURNS: dict[int, float] = {
@@ -155,47 +135,6 @@ def limit_excess(body_rot: Tensor) -> Tensor:
     most = torch.tensor([TURNS.get(joint, 1.2) for joint in range(1, BODY_JOINTS)]).to(body_rot)
     cosine = (body_rot.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
     return (cosine.clamp(-1 + 1e-6, 1 - 1e-6).acos() - most).clamp_min(0)
-
-
-MASSES: tuple[tuple[int, int, float, float], ...] = (
-    (PELVIS, SPINE3, 0.5, 0.355),
-    (SPINE3, NECK, 0.5, 0.142),
-    (NECK, HEAD, 1.0, 0.081),
-    *((shoulder, elbow, 0.436, 0.028) for shoulder, elbow in zip(SHOULDERS, ELBOWS, strict=True)),
-    *((elbow, wrist, 0.682, 0.022) for elbow, wrist in zip(ELBOWS, WRISTS, strict=True)),
-    *((hip, knee, 0.433, 0.100) for hip, knee in zip(HIPS, KNEES, strict=True)),
-    *((knee, ankle, 0.606, 0.061) for knee, ankle in zip(KNEES, ANKLES, strict=True)),
-)
-"""From joint, to joint, position of the mass between them, share of the body's mass: Dempster's segments, after
-Winter (Biomechanics and Motor Control of Human Movement, table 4.1), hands with forearms and feet with shins."""
-
-
-def centre_of_mass(joints: Tensor) -> Tensor:
-    """The body's centre of mass. (..., 22, 3) -> (..., 3) metres"""
-    first, second, place, mass = zip(*MASSES, strict=True)
-    share = torch.tensor(place).to(joints)[:, None]
-    points = (1 - share) * joints[..., first, :] + share * joints[..., second, :]
-    weight = torch.tensor(mass).to(joints)[:, None]
-    return (weight * points).sum(dim=-2) / weight.sum()
-
-
-def off_balance(joints: Tensor, fps: float = FPS) -> Tensor:
-    """Distance of the zero moment point from the support of the feet. (..., T, P, 22, 3) -> (..., T - 2, P) metres
-
-    There the floor must push to keep the body from tipping over: below the centre of mass, shifted by its acceleration
-    (Vukobratovic and Borovac 2004). The feet support the line between them and `SOLE` around it.
-    """
-    centre = centre_of_mass(joints)
-    pull = (centre[..., 2:, :, :] - 2 * centre[..., 1:-1, :, :] + centre[..., :-2, :, :]) * fps**2
-    now = joints[..., 1:-1, :, :, :]
-    height = centre[..., 1:-1, :, 1:2]
-    weight = (GRAVITY + pull[..., 1:2]).clamp_min(0.2 * GRAVITY)
-    point = centre[..., 1:-1, :, [0, 2]] - height * pull[..., [0, 2]] / weight
-    left, right = (now[..., [ankle, toe], :][..., [0, 2]].mean(dim=-2) for ankle, toe in zip(ANKLES, TOES, strict=True))
-    across = right - left
-    share = ((point - left) * across).sum(-1) / across.square().sum(-1).clamp_min(1e-9)
-    near = left + share.clamp(0, 1)[..., None] * across
-    return ((point - near).square().sum(-1).clamp_min(1e-12).sqrt() - SOLE).clamp_min(0)
 
 
 def pair_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) -> Tensor:
