@@ -108,6 +108,22 @@ def test_a_keyframe_is_reached_exactly(live: Live) -> None:
     assert end[0] - at[0] == pytest.approx(0.4, abs=1e-3)
 
 
+def test_who_is_steered_arrives_in_the_most_upright_of_its_last_poses(model) -> None:
+    """That is the one with the highest pelvis, neither the last one nor one from before the last second."""
+    start = random_scene(1, 48, 2, torch.Generator().manual_seed(1))
+    T_world_root = start.T_world_root.clone()
+    T_world_root[0, :, 1, 1, 3] = 0.9
+    T_world_root[0, [8, 29], 1, 1, 3] = torch.tensor([1.2, 1.0])
+    start = start.replace(T_world_root=T_world_root)
+    live = Live(model, start=start, generator=torch.Generator().manual_seed(1))
+    live.settings.steps, live.settings.task = 2, "inbetweening"
+    live.settings.goals = {1: Goal.of(canonical_frame(T_world_root)[0, -1, 1])}
+    assert live.advance().frames == REACH
+    arrived = live.scene.slice(live.scene.frames - 4)
+    torch.testing.assert_close(arrived.body_rot[0, :, 1], start.body_rot[0, 29, 1].expand(4, -1, -1, -1))
+    torch.testing.assert_close(arrived.T_world_root[0, :, 1, 1, 3], torch.full((4,), 1.0))
+
+
 def test_who_is_steered_comes_nearer_and_the_others_are_generated_from_that(live: Live) -> None:
     live.settings.task, live.settings.fields = "motion_control", {"target": (0,), "block": 2}
     goal = live.scene.T_world_root[0, -1, 1, [0, 2], 3] + torch.tensor([2.0, 0.0])
