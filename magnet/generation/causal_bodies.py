@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
-from magnet.generation.conditioning import receptive_field
+from magnet.generation.conditioning import receptive_field, require_finite
 from magnet.generation.settling import PACE, Corrected, settled_on
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
@@ -211,7 +211,9 @@ def decode_bodies(
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     placed = world.by_frame(world.placed[first:stop])
-    return freeze_after(made, torch.cat([placed, placed[-1:].expand(more * TOKEN_FRAMES, -1)]), before)
+    there = torch.cat([placed, placed[-1:].expand(more * TOKEN_FRAMES, -1)])
+    require_finite(made, there)
+    return freeze_after(made, there, before)
 
 
 def shown_path(world: World, near: int, ways: Tensor | None, stop: int) -> Tensor:

@@ -50,6 +50,25 @@ def label(scene: Scene, number: int) -> str:
     return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
 
 
+def require_finite(made: Scene, there: Tensor) -> None:
+    """Refuse bodies that a broken network made, before anything is built on them. there (T, P) bool, who is asked about
+
+    Raises:
+        ValueError: NaN or infinities of somebody who is there; names scene and agent.
+    """
+    if bool((made.body_rot.sum() + made.T_world_root.sum()).isfinite()):  # one number tells of all
+        return
+    finite = made.body_rot.flatten(3).isfinite().all(dim=-1) & made.T_world_root.flatten(3).isfinite().all(dim=-1)
+    bad = (~finite & there & made.present[:, None]).any(dim=1)  # (B, P)
+    if bool(bad.any()):
+        b, agent = bad.nonzero()[0].tolist()
+        raise ValueError(
+            f"{label(made, b)}, agent {agent}: the model makes motion that is not finite (NaN or infinity). Its "
+            "weights are broken, or too large for the precision that it samples with: take an earlier checkpoint, or "
+            "float32"
+        )
+
+
 def receptive_field(model: DenoiserCore) -> tuple[int, int]:
     """Tokens before and after that a code or a decoded frame depends on, the same for encoder and decoder."""
     return model.tokenizer.receptive_field

@@ -19,7 +19,7 @@ from magnet.generation.blending import (
     warp_to_keyframe,
 )
 from magnet.generation.causal_bodies import decoded_frames, finalized_bodies
-from magnet.generation.conditioning import first_of, lookahead_limit, receptive_field, spans
+from magnet.generation.conditioning import first_of, lookahead_limit, receptive_field, require_finite, spans
 from magnet.generation.entering import starts
 from magnet.generation.separation import Decode, separated
 from magnet.generation.settling import LEAD, Corrected, settled_block, settled_chunk
@@ -376,6 +376,7 @@ class WorldState:
             keep = self.by_frame(self.known[low:high])
             decoded = crossfade_given(decoded, given, T_world_can, keep, self.options.blend)
         decoded = decoded.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
+        require_finite(decoded, self.by_frame(self.placed[first:stop]))
         if self.settle is not None:
             fixed, goes_on = self.by_frame(self.known[first:stop]), self.placed[first:stop].all(dim=0).to(tokens.device)
             seen = decoded.replace(present=decoded.present & goes_on)  # nobody makes way for whom nothing is known of

@@ -5,7 +5,6 @@ To add a placement, write its function, name it in `Placement`, and list it in `
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -138,11 +137,15 @@ def fuse(predicted: Predicted) -> Tensor:
     """
     assert predicted.T_self_partner is not None
     pair_yaw, pair_ground = to_planar(predicted.T_self_partner)
-    present, start_yaw = predicted.present, predicted.start_yaw
+    present, start_yaw, frames = predicted.present, predicted.start_yaw, predicted.delta_yaw.shape[1]
     own = torch.where(predicted.fixed, FIXED, torch.ones_like(start_yaw[0]))
     partner = predicted.partner
     somebody = partner != torch.arange(len(partner), device=partner.device)[:, None]
-    each = predicted.pairwise_weight * (present[:, :, None] & present[:, partner] & somebody).to(start_yaw)
+    met = present[:, :, None] & present[:, partner] & somebody  # (B, P, K)
+    # No weight makes nothing of NaN: pairs that are not read are replaced.
+    pair_yaw = torch.where(met[:, None], pair_yaw, 0.0)
+    pair_ground = torch.where(met[:, None, ..., None], pair_ground, 0.0)
+    each = predicted.pairwise_weight * met.to(start_yaw)
     together = (
         torch.zeros_like(each[:, :, :1]).expand(-1, -1, len(partner)).scatter_add(2, partner.expand(each.shape), each)
     )
@@ -158,11 +161,13 @@ def fuse(predicted: Predicted) -> Tensor:
 
     steps, begins = predicted.delta_yaw[..., None], start_yaw[:, None, :, None]
     turned = start_yaw[:, None] + predicted.delta_yaw.cumsum(dim=1)
-    turns = None
-    for rounds in itertools.count():
-        # A pair's heading counts the short way round: by whole turns that follow from the frames before.
+    turns, recording = None, is_recording(turned.device)
+    # A pair's heading counts the short way round: by whole turns that follow from the frames before. So those of the
+    # first frame are right at once, and each round makes right those of one frame more, if not of all.
+    for _ in range(ROUNDS if recording else max(frames, 1)):
         new = ((pair_yaw - (turned[:, :, partner] - turned[..., None])) / TURN).round()
-        if turns is not None and (rounds == ROUNDS if is_recording(new.device) else torch.equal(new, turns)):
+        new = new.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)  # NaN would never equal itself
+        if turns is not None and not recording and torch.equal(new, turns):
             break
         turns = new
         yaw = accumulated(keep, keep @ steps + pulled((pair_yaw - TURN * turns)[..., None]), begins)[..., 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import torch
 
 from magnet.api import Model
 from magnet.denoiser.module import Denoiser
+from magnet.generation.conditioning import require_finite
 from magnet.generation.live import Live
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate, stream
@@ -89,6 +91,28 @@ def test_another_frame_rate_is_refused_at_every_way_in(way, model, duet):
 def test_what_is_given_and_not_finite_is_refused_at_every_way_in(way, value, model, duet):
     with pytest.raises(ValueError, match=r"^scene 0, agent 0: frame 5 is not finite"):
         WAYS[way](model, with_roots(duet, 5, 0, value))
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if way not in ("stream", "live", "live partner")])
+def test_motion_of_a_broken_network_is_refused_and_not_waited_for(way, model, duet):
+    """One weight that is not a number: whole turns of NaN were counted for ever."""
+    broken = copy.deepcopy(model)
+    with torch.no_grad():
+        broken.transformer.out_proj.bias[-1] = math.nan  # of a pairwise transform
+        broken.transformer.out_proj.bias[broken.layout.latent] = math.nan
+    with pytest.raises(ValueError, match=r"^scene 0, agent \d: the model makes motion that is not finite"):
+        WAYS[way](broken, duet)
+
+
+def test_whoever_is_absent_or_not_yet_there_need_not_be_finite(duet):
+    there = torch.ones(duet.frames, 2, dtype=torch.bool)
+    require_finite(duet, there)
+    broken = with_roots(duet, 5, 1, math.nan)
+    with pytest.raises(ValueError, match=r"^scene 0, agent 1: the model makes motion that is not finite"):
+        require_finite(broken, there)
+    require_finite(broken.replace(present=torch.tensor([[True, False]])), there)
+    there[5, 1] = False
+    require_finite(broken, there)
 
 
 @pytest.mark.parametrize("metres", [1.0, -1.0, 0.4])

@@ -9,8 +9,9 @@ import torch
 import torch.utils._python_dispatch
 from torch import Tensor
 
+import magnet.motion.placement as placement_module
 from magnet.motion.frames import from_planar, to_planar
-from magnet.motion.placement import PLACEMENTS, Placement, place
+from magnet.motion.placement import PLACEMENTS, Placement, accumulated, place
 from magnet.motion.planar import rotate_ground
 from tests.counting import Counting
 
@@ -86,3 +87,56 @@ def test_fuse_takes_few_products_however_many_frames_there_are() -> None:
         return counter.operators
 
     assert operators(256) < operators(16) + 240, "a loop would take twenty for each frame more"
+
+
+def random_planar(*shape: int, turn: float, generator: torch.Generator) -> Tensor:
+    return from_planar(turn * torch.randn(shape, generator=generator), torch.randn(*shape, 2, generator=generator))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_what_is_not_finite_ends_and_spoils_its_own_scene_from_its_own_frame_on(
+    placement: Placement, value: float
+) -> None:
+    """One NaN of a network made `fuse` count for ever: whole turns of NaN never stay as they were."""
+    generator = torch.Generator().manual_seed(3)
+    deltas = random_planar(2, 12, 3, turn=0.1, generator=generator)
+    pairs = random_planar(2, 12, 3, 2, turn=4.0, generator=generator)
+    start = random_planar(2, 3, turn=3.0, generator=generator)
+    right = place(deltas, pairs, start, placement, 0.3)
+    deltas[0, 7, 0] = pairs[0, 7, 0] = value
+    placed = place(deltas, pairs, start, placement, 0.3)
+    assert not placed[0, 7, 0].isfinite().all()
+    assert torch.equal(placed[1], right[1]) and torch.equal(placed[0, :7], right[0, :7])
+
+
+def test_fuse_does_not_read_pairs_with_somebody_absent() -> None:
+    """Nor where a slot points at nobody: no weight makes a number of NaN."""
+    generator = torch.Generator().manual_seed(4)
+    deltas = random_planar(2, 12, 3, turn=0.1, generator=generator)
+    pairs = random_planar(2, 12, 3, 2, turn=4.0, generator=generator)
+    start = random_planar(2, 3, turn=3.0, generator=generator)
+    present = torch.tensor([[True, True, False], [True, True, True]])
+    partner = torch.tensor([[1, 2], [0, 2], [0, 2]])  # the last slot of agent 2 is at nobody
+    right = place(deltas, pairs, start, "fuse", 0.3, present, partner=partner)
+    pairs[0, :, :, 1] = pairs[0, :, 2] = pairs[1, :, 2, 1] = torch.nan
+    assert torch.equal(place(deltas, pairs, start, "fuse", 0.3, present, partner=partner), right)
+
+
+def test_fuse_counts_turns_once_a_frame_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each count settles one frame more: so many suffice even where each frame's turns hang on those before."""
+    generator = torch.Generator().manual_seed(5)
+    deltas, start = (random_planar(1, *shape, turn=3.0, generator=generator) for shape in ((48, 4), (4,)))
+    pairs = random_planar(1, 48, 4, 3, turn=4.0, generator=generator)
+    counts: list[int] = []
+
+    def counted(*given: Tensor) -> Tensor:
+        counts.append(1)
+        return accumulated(*given)
+
+    monkeypatch.setattr(placement_module, "accumulated", counted)
+    placed = place(deltas, pairs, start, "fuse", 0.3)
+    assert 3 < len(counts) <= 49, "one a count of turns, and one of places"
+    everybody, nobody = torch.ones(1, 4, dtype=torch.bool), torch.zeros(4, dtype=torch.bool)
+    yaws, grounds = frame_by_frame(deltas, pairs, start, 0.3, everybody, nobody)
+    torch.testing.assert_close(placed, from_planar(yaws, grounds).float(), rtol=1e-4, atol=1e-4)
