@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -59,6 +60,30 @@ class WeightEMA(WeightAveraging):
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
             self._average_model = Average(self._average_model.module, self.decay)
+
+    def _swap_models(self, pl_module: LightningModule) -> None:
+        """Exchange the weights and their average.
+
+        Lightning writes into `.data`, of which nobody is told who keeps something made of the weights: what is packed
+        for sampling would stay that of other weights. So this and the next replace its own.
+        """
+        with torch.no_grad():
+            for average, current in self._pairs(pl_module):
+                held = average.clone()
+                average.copy_(current)
+                current.copy_(held)
+
+    def _copy_average_to_current(self, pl_module: LightningModule) -> None:
+        with torch.no_grad():
+            for average, current in self._pairs(pl_module):
+                current.copy_(average)
+
+    def _pairs(self, pl_module: LightningModule) -> Iterator[tuple[Tensor, Tensor]]:
+        """Parameters and buffers of the average, each beside the model's."""
+        assert self._average_model is not None
+        module = self._average_model.module
+        yield from zip(module.parameters(), pl_module.parameters(), strict=True)
+        yield from zip(module.buffers(), pl_module.buffers(), strict=True)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._own = None
