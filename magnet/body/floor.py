@@ -71,28 +71,33 @@ def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> T
     return torch.where(over | under, heights.gather(1, nearest)[:, 0], 0.0)
 
 
+def counting(scene: Scene) -> Tensor:
+    """Frames of whom tell of the floor: of people who are there, if not masked. -> (B, T, P) bool"""
+    counts = scene.present[:, None].expand(scene.T_world_root.shape[:3])
+    return counts if scene.valid is None else counts & scene.valid[..., None]
+
+
 def on_floor(scene: Scene, body: Body | None = None) -> Scene:
-    """The same motion, each scene moved so that its lowest person stands on y = 0.
+    """The same motion, each scene moved so that its lowest person stands on y = 0; masked frames do not count.
 
     body: as for `lowest`.
     """
     if not scene.present.any() or not scene.frames:
         return scene
-    counts = scene.present[:, None].expand(scene.T_world_root.shape[:3])
-    heights = standing(lowest(scene, body), counts).nan_to_num(nan=torch.inf).amin(dim=1)  # (B,)
+    heights = standing(lowest(scene, body), counting(scene)).nan_to_num(nan=torch.inf).amin(dim=1)  # (B,)
     T_new_world = torch.eye(4, dtype=scene.T_world_root.dtype, device=scene.device).repeat(scene.scenes, 1, 1, 1, 1)
     T_new_world[:, 0, 0, 1, 3] = -torch.where(heights.isfinite(), heights, 0.0).to(T_new_world)
     return scene.transformed(T_new_world)
 
 
 def level(scene: Scene, body: Body | None = None) -> float:
-    """Height in metres of the scene whose people all stand farthest from y = 0; 0 if none does.
+    """Height in metres of the scene whose people all stand farthest from y = 0; 0 if none does, without masked frames.
 
     body: as for `lowest`.
     """
     if not scene.present.any() or not scene.frames:
         return 0.0
-    away = off_floor(lowest(scene, body), scene.present[:, None].expand(scene.T_world_root.shape[:3]))
+    away = off_floor(lowest(scene, body), counting(scene))
     return float(away[away.abs().argmax()])
 
 

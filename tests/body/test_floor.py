@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import base, floor, load_body
-from magnet.body.floor import JUMP, lowest, off_floor, on_floor, standing
+from magnet.body.floor import JUMP, OFF, level, lowest, off_floor, on_floor, standing
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.synthetic import Synthetic
 from magnet.export.bvh_read import read_bvh
@@ -96,6 +96,20 @@ def test_scenes_are_put_on_the_floor_each_by_itself():
     assert torch.allclose(placed.T_world_root[0], placed.T_world_root[1], atol=1e-5)
     other = scene.T_world_root[..., [0, 2], 3]
     assert torch.equal(placed.T_world_root[:1, ..., [0, 2], 3], other)
+
+
+@pytest.mark.parametrize("metres", [-3.0, torch.nan])
+def test_masked_frames_say_nothing_of_the_floor(metres: float) -> None:
+    """They may hold anything, and go along with the others."""
+    scene = lifted(still([0, 0, 0], 0.93).slice(0, 24), 0.5)
+    T, valid = scene.T_world_root.clone(), torch.ones(1, 24, dtype=torch.bool)
+    T[:, 20:, :, 1, 3], valid[:, 20:] = metres, False
+    masked = scene.replace(T_world_root=T, valid=valid)
+    assert level(masked) == level(scene) > OFF
+    assert torch.equal(on_floor(masked).T_world_root[:, :20], on_floor(scene).T_world_root[:, :20])
+    nothing = masked.replace(valid=torch.zeros_like(valid))
+    assert level(nothing) == 0.0
+    assert torch.equal(on_floor(nothing).T_world_root[:, :20], scene.T_world_root[:, :20])
 
 
 def test_nobody_and_nothing_is_put_nowhere():
