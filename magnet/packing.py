@@ -94,7 +94,7 @@ class Kept(Generic[Made]):
 
     def __init__(self, make: Callable[[nn.Module], Made]) -> None:
         self.make = make
-        self._made: weakref.WeakKeyDictionary[nn.Module, tuple[list[nn.Parameter], list[int], Made]]
+        self._made: weakref.WeakKeyDictionary[nn.Module, tuple[list[nn.Parameter], list[float], Made]]
         self._made = weakref.WeakKeyDictionary()
 
     def of(self, network: nn.Module) -> Made:
@@ -106,6 +106,11 @@ class Kept(Generic[Made]):
         return kept[2]
 
 
-def state_of(weights: Sequence[Tensor]) -> list[int]:
+def state_of(weights: Sequence[Tensor]) -> list[float]:
     """Numbers that change when weights do."""
-    return [number for each in weights for number in (each.data_ptr(), each._version)]
+    return [number for each in weights for number in (each.data_ptr(), version_of(each))]
+
+
+def version_of(weight: Tensor) -> float:
+    """How often a tensor was written to; what was made in inference mode does not count that, so all of it is read."""
+    return float(weight.sum(dtype=torch.float64)) if weight.is_inference() else weight._version

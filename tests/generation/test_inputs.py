@@ -104,6 +104,20 @@ def test_motion_of_a_broken_network_is_refused_and_not_waited_for(way, model, du
         WAYS[way](broken, duet)
 
 
+def test_a_model_made_in_inference_mode_samples_the_same_there_and_outside(model, duet):
+    """Its tensors count no versions, by which packed weights are looked up."""
+
+    def sampled(model: Denoiser) -> Scene:
+        return generate(model, duet, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0))
+
+    expected = sampled(model).T_world_root
+    with torch.inference_mode():
+        made = tiny_denoiser(max_agents=3, window=12)
+        made.load_state_dict(model.state_dict())
+        assert torch.equal(sampled(made).T_world_root, expected)
+    assert torch.equal(sampled(made).T_world_root, expected)
+
+
 def test_whoever_is_absent_or_not_yet_there_need_not_be_finite(duet):
     there = torch.ones(duet.frames, 2, dtype=torch.bool)
     require_finite(duet, there)
