@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from torch.utils.weak import WeakIdKeyDictionary
 
 from magnet.denoiser.compiled import Compiled, records
-from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, rotation, sinusoids
+from magnet.denoiser.transformer import Transformer, TransformerBlock, block_causal, conditioned, rotation, sinusoids
 from magnet.packing import Kept, Linear, int8_linear_of, linear_of, norm_of, packs
 from magnet.precision import quick_bf16, quick_int8
 from magnet.sampling.noise import LEVELS
@@ -159,7 +159,9 @@ class LeanTransformer:
         packed = int8_linear_of if precision == "int8" else layer
         self.blocks = [LeanBlock(block, packed, self.dtype, block is blocks[-1]) for block in blocks]  # type: ignore[arg-type]
         self.exit = linear_of(network.out_proj.weight, network.out_proj.bias, torch.float32)
-        self.condition = network.condition if o.cond_dim else None
+        # Not the network's own method: who holds that holds the network, which then is never let go.
+        given = functools.partial(conditioned, network.cond_proj, network.no_cond) if o.cond_dim else None
+        self.condition: Callable[..., Tensor] | None = given
         packed_once = device.type == "cpu" and packs() and not (precision == "int8" and quick_int8(device))
         why = f"what is packed for the processor ({precision}) is not compiled; int8 is" if packed_once else None
         self._compiled = Compiled(self._all_blocks, "sampler.compile", refused=why)

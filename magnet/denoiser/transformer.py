@@ -130,6 +130,22 @@ class TransformerBlock(nn.Module):
         return self.norm_mlp(x + self.drop(self.mlp(x)))
 
 
+def conditioned(proj: nn.Linear, no_cond: Tensor, cond: Tensor | None, B: int, N: int) -> Tensor:
+    """What a condition of C numbers adds to each token; `no_cond` (d,) where it is None or not finite.
+
+    cond (B, C) or (B, N, C) -> (B or 1, N or 1, 1, d)
+    """
+    size = proj.in_features
+    if cond is None:
+        return no_cond[None, None, None]
+    if cond.shape not in ((B, size), (B, N, size)):
+        raise ValueError(f"cond: got {tuple(cond.shape)}, expected ({B}, {size}) or ({B}, {N}, {size})")
+    cond = cond[:, None, None] if cond.ndim == 2 else cond[:, :, None]
+    known = cond.isfinite().all(dim=-1, keepdim=True)
+    embedded = proj(torch.where(known, cond, 0.0).to(no_cond.dtype))
+    return torch.where(known, embedded, no_cond)
+
+
 class Transformer(nn.Module):
     """Predicts clean tokens from tokens at any mix of noise levels.
 
@@ -199,18 +215,11 @@ class Transformer(nn.Module):
 
     def condition(self, cond: Tensor | None, B: int, N: int) -> Tensor | None:
         """What a condition adds to each token. -> (B or 1, N or 1, 1, d)"""
-        size = self.options.cond_dim
-        if cond is not None and (not size or cond.shape not in ((B, size), (B, N, size))):
-            wanted = f"({B}, {size}) or ({B}, {N}, {size})" if size else "none: the model has network.cond_dim 0"
-            raise ValueError(f"cond: got {tuple(cond.shape)}, expected {wanted}")
-        if not size:
-            return None
-        if cond is None:
-            return self.no_cond[None, None, None]
-        cond = cond[:, None, None] if cond.ndim == 2 else cond[:, :, None]
-        known = cond.isfinite().all(dim=-1, keepdim=True)
-        embedded = self.cond_proj(torch.where(known, cond, 0.0).to(self.no_cond.dtype))
-        return torch.where(known, embedded, self.no_cond)
+        if self.options.cond_dim:
+            return conditioned(self.cond_proj, self.no_cond, cond, B, N)
+        if cond is not None:
+            raise ValueError(f"cond: got {tuple(cond.shape)}, expected none: the model has network.cond_dim 0")
+        return None
 
     def _blocks(self, x: Tensor, present: Tensor) -> Tensor:
         """All blocks, on those who are there only: scenes with equally many people run together. (B, N, P, d)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
+import weakref
 from typing import Any
 
 import pytest
@@ -79,6 +81,29 @@ def test_every_part_can_be_left_out_or_added(options: dict[str, Any]) -> None:
     if cond is None:
         with pytest.raises(ValueError, match="cond: got"):
             LeanTransformer(made)(*asked, torch.randn(2, 4))
+
+
+@pytest.mark.parametrize("options", [{}, {"cond_dim": 4}], ids=str)
+@torch.no_grad()
+def test_a_network_that_nobody_holds_is_let_go_with_its_lean_form(options: dict[str, Any]) -> None:
+    made = network(**options)
+    lean(made)(*question(made, 1, 4))
+    watched = weakref.ref(made), weakref.ref(made.out_proj.weight)
+    del made
+    gc.collect()
+    assert [each() for each in watched] == [None, None]
+
+
+@torch.no_grad()
+def test_a_network_made_in_inference_mode_has_a_lean_form_that_follows_its_weights() -> None:
+    """Such tensors do not count how often they are written to."""
+    with torch.inference_mode():
+        made = network()
+        asked = question(made, 1, 4)
+        torch.testing.assert_close(lean(made)(*asked), made(*asked), rtol=1e-4, atol=1e-5)
+        made.out_proj.weight.mul_(2.0)
+    assert lean(made) is lean(made)
+    torch.testing.assert_close(lean(made)(*asked), made(*asked), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("causal_block", [0, 2])
