@@ -45,6 +45,20 @@ def check_request(
     require_rate(scene)
 
 
+def check_condition(cond: Tensor | None, scenes: int, weight: float) -> None:
+    """Refuse conditions of another number of scenes, and a weight of guidance by none.
+
+    Raises:
+        ValueError: what was got and expected.
+    """
+    if cond is not None and len(cond) != scenes:
+        raise ValueError(f"cond: got {len(cond)} conditions, expected one for each of {scenes} scenes")
+    if cond is None and weight:
+        raise ValueError(
+            f"guidance.cond_weight: got {weight:g} and no condition to guide by; give `cond`, or leave it at 0"
+        )
+
+
 def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     """Refuse given motion that is not valid; what is not given may hold anything. known (N, P) bool
 

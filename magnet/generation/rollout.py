@@ -26,12 +26,13 @@ from magnet.generation.conditioning import (
     require_people,
     task_lookahead_limit,
 )
-from magnet.generation.inputs import check_given, check_request, whole_tokens
+from magnet.generation.inputs import check_condition, check_given, check_request, whole_tokens
 from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.packing import count_unseen_writes
 from magnet.precision import dtype_of
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
@@ -153,6 +154,7 @@ class Rollout:
         cond: Tensor | None = None,
     ) -> None:
         check_request(model, scene, context, frames, samples, task)
+        count_unseen_writes(model)
         layout = model.layout
         self.model, self.options, self.chunk = model, (options or SamplerOptions()).filled(model.sampling), chunk
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
@@ -185,16 +187,8 @@ class Rollout:
         check_given(self.scene, self.known, o.any_floor)
         B, P = scene.scenes * samples, layout.agents
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta, scale=o.noise_scale or 1.0)
+        check_condition(cond, scene.scenes, o.guidance.cond_weight)
         self.cond = None if cond is None else cond.to(model.device).repeat_interleave(samples, dim=0)
-        if self.cond is not None and len(self.cond) != B:
-            raise ValueError(
-                f"cond: got {len(self.cond) // samples} conditions, expected one for each of {scene.scenes} scenes"
-            )
-        if self.cond is None and o.guidance.cond_weight:
-            raise ValueError(
-                f"guidance.cond_weight: got {o.guidance.cond_weight:g} and no condition to guide by; give `cond`, "
-                "or leave it at 0"
-            )
         self.encoders: Encoders = {}
         self.stats.begin(B)
         self.first = self.stop = self.reached = 0  # one past the last row that has been generated

@@ -118,6 +118,25 @@ def test_a_model_made_in_inference_mode_samples_the_same_there_and_outside(model
     assert torch.equal(sampled(made).T_world_root, expected)
 
 
+def test_weights_that_are_written_unseen_are_sampled_with(model, duet):
+    """Torch does not count writes into `.data`, as Lightning's own averages make them."""
+
+    def sampled(model: Denoiser) -> Scene:
+        return generate(model, duet, JointFuture(), CONTEXT, FRAMES, 1, FAST, torch.Generator().manual_seed(0))
+
+    written, fresh = copy.deepcopy(model), copy.deepcopy(model)
+    before = sampled(written)
+    for each in (written, fresh):
+        for weight in each.parameters():
+            weight.data.mul_(1.01)
+    after = sampled(written)
+    assert not torch.equal(after.T_world_root, before.T_world_root)
+    assert torch.equal(after.T_world_root, sampled(fresh).T_world_root)
+    versions = [weight._version for weight in written.parameters()]
+    sampled(written)
+    assert versions == [weight._version for weight in written.parameters()], "what is the same stays packed"
+
+
 def test_whoever_is_absent_or_not_yet_there_need_not_be_finite(duet):
     there = torch.ones(duet.frames, 2, dtype=torch.bool)
     require_finite(duet, there)
