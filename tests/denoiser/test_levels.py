@@ -116,6 +116,13 @@ def test_live_levels_are_a_past_one_or_two_tokens_and_an_unknown_future(generato
     assert 0.4 < float((where == 16 - 1 - UNKNOWN_AFTER).double().mean()) < 0.65  # where a window that moves has it
 
 
+def test_one_live_block_in_five_is_of_two_tokens(generator):
+    levels = live_levels(NoiseOptions("mixture"), 4000, 16, 2, generator)
+    length = ((levels > 0) & (levels < LEVELS)).sum(dim=1).amax(dim=1)
+    length = length[length > 0]
+    assert float((length == 2).double().mean()) == pytest.approx(0.2, abs=0.03)
+
+
 def test_live_levels_ask_what_each_live_task_asks(generator):
     levels = live_levels(MIXTURE, 4000, 16, 2, generator)
     begins = (levels > 0).any(dim=2).double().argmax(dim=1)

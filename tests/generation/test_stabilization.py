@@ -115,6 +115,21 @@ def test_of_two_levels_the_higher_one_counts() -> None:
     assert shown(replace(guidance, stabilization_unseen=0)) == [0, 0, 0, 450, 450]
 
 
+def test_beside_somebody_given_nothing_is_shown_less_faintly_than_alone() -> None:
+    known = torch.tensor([[True, True], [False, True], [False, True]])
+    stage = registry.get("partner_inpainting")().schedule(Grid(tokens=3, agents=2, context=1)).stages[-1]
+
+    def shown(level: int | None, beside: int) -> list[int]:
+        guidance = Guidance(stabilization_level=level, stabilization_after=1, stabilization_beside=beside)
+        levels = faint_levels(guidance, known, stage)
+        assert levels is not None and not levels[:, 1].any()
+        return levels[:, 0].tolist()
+
+    assert shown(None, 300) == [0, 300, 300]
+    assert shown(450, 300) == [0, 450, 450]
+    assert shown(450, 700) == [0, 700, 700]
+
+
 @pytest.mark.parametrize("name", ["joint_future", "motion_control", "agentic_sync"])
 def test_a_stream_knows_how_long_ago_somebody_was_given(model, name) -> None:
     """Rows that are let go hold what was given last; frames come as from one call."""

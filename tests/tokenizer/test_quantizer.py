@@ -81,6 +81,17 @@ def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator
     assert (vectors == book.codes[0, 3]).all(-1).any()
 
 
+@pytest.mark.parametrize(("vectors", "dies"), [(4, False), (16, False), (64, True), (400, True)])
+def test_few_vectors_kill_few_codes(vectors: int, dies: bool, generator: torch.Generator) -> None:
+    """A code that was chosen seldom is dead only where a batch has vectors enough to choose it."""
+    book = ResidualVQ(16, 8, ema_decay=0.9, dead_code_threshold=1.0)
+    book.kmeans_init(clusters(300, generator), generator)
+    book.codes[0, 3] = 1e3
+    book.ema_count[0, 3], book.ema_sum[0, 3] = 0.5, 0.5e3
+    book(clusters(vectors, generator), generator=generator)
+    assert bool((book.codes[0, 3] != 1e3).any()) == dies
+
+
 def test_without_revival_an_unused_code_does_not_move(generator: torch.Generator) -> None:
     book = ResidualVQ(16, 8, dead_code_threshold=0.0)
     book.kmeans_init(clusters(300, generator), generator)
