@@ -127,6 +127,36 @@ def test_two_who_are_known_are_shown_where_they_stand_to_whoever_is_not(model: D
     assert sum(seen) > 0, "some egos are not known"
 
 
+def test_two_who_are_no_partners_are_shown_with_the_noise_of_the_noisier(model: Denoiser) -> None:
+    """An ego's token holds no noise of the ego itself, and none of somebody whom both know."""
+    differ = []
+
+    class Watched(CrowdRollout):
+        def _seen_by(self, *asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+            T, noise, level = super()._seen_by(*asked)
+            self.seen.append(level)  # of the first, then of the second, whose noises are told apart by sign
+            return T, torch.full_like(noise, 1e6 if len(self.seen) == 2 else -1e6), level
+
+        def _work_out(self, about: torch.Tensor, noisy: torch.Tensor, levels: torch.Tensor) -> None:
+            self.seen: list[torch.Tensor] = []
+            super()._work_out(about, noisy, levels)
+            if not self.seen:
+                return
+            views, other = self.views, partners(4)
+            lacking = (views.pair < 0) & views.present[..., None] & views.present[:, other]
+            v, a, s = lacking.nonzero(as_tuple=True)
+            of_second = about[:, :, v, a, s].mean(dim=-1) > 0
+            first, second = self.seen
+            shown = torch.maximum(levels[:, :, views.people[v, a]], levels[:, :, views.people[v, other[a, s]]])
+            unlike = (first != second) & (shown > 0)
+            assert torch.equal(of_second[unlike], (second > first)[unlike])
+            differ.append(int(unlike.sum()))
+
+    task = registry.get("motion_control")(target=(0, 2, 4, 6))
+    list(Watched(model, crowd(9, 24, spacing=1.4), task, 8, 16, QUICK, seeded()).chunks())
+    assert sum(differ) > 0, "some are given, others are not"
+
+
 @pytest.mark.slow
 def test_bodies_are_kept_apart_as_they_are_shown_in_the_end() -> None:
     """A block decoded alone is of other poses than in the middle of its scene; those would be kept apart in vain."""
