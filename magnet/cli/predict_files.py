@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from magnet.sampling.options import SamplerOptions
 
 CONTEXT = 32
-"""Frames that are given of everybody where nothing is said, as in the tests of tasks: a second."""
+"""Frames given of everybody where nothing is said and the task reads what comes later, as in its tests: a second."""
 FUTURE = 150
 """Frames that are sampled where nothing is said and nothing recorded is read: five seconds."""
 HELP = "magnet predict --help files"
@@ -52,7 +52,8 @@ def meant(arguments: Sequence[str]) -> bool:
     first = arguments[0] if arguments else ""
     about_help = list(arguments[:2]) == ["--help", "files"] or first == "--help=files"
     people = any(argument.partition("=")[0] == "--people" for argument in arguments)
-    return about_help or people or (not first.startswith("-") and Path(first).suffix != "") or _names_files(arguments)
+    file = not first.startswith("-") and (Path(first).suffix != "" or (first != "" and Path(first).is_dir()))
+    return about_help or people or file or _names_files(arguments)
 
 
 def _names_files(arguments: Sequence[str]) -> bool:
@@ -76,7 +77,8 @@ def parser() -> argparse.ArgumentParser:
     add("--task.FIELD", metavar="VALUE", help="an option of the task")
     add("--people", type=int, metavar="P", help="people in all, up to 200; those without a file are generated")
     add("--spacing", type=float, metavar="M", help="metres between the groups of a crowd (default: 3)")
-    add("--context", type=int, metavar="T", help=f"frames given of everybody at the start ({CONTEXT}, or 0 as needed)")
+    given = f"all of IN where the task only goes on from it, else {CONTEXT}, or 0 as needed"
+    add("--context", type=int, metavar="T", help=f"frames given of everybody at the start (default: {given})")
     frames = f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})"
     add("--frames", type=int, metavar="T", help=frames)
     add("--samples", type=int, default=1, metavar="S", help="samples (default: %(default)s)")
@@ -105,6 +107,8 @@ def main(arguments: Sequence[str]) -> int:
     for path in options.inputs:
         if Path(path).suffix.lower() in READ and not Path(path).exists():  # before anything else is asked for
             raise CommandError(f"{path}: no such file")
+        if Path(path).is_dir():
+            raise CommandError(f"{path} is a folder: give its files, {files_of(Path(path))}")
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
@@ -129,13 +133,14 @@ def main(arguments: Sequence[str]) -> int:
     model = Model(DenoiserCore.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
-    context, frames = lengths(options, task, scene, added, model)
+    scene, context, frames = lengths(options, task, scene, added, model)
     began = time.perf_counter()
     made = model.predict(
         scene, task.name, context=context, frames=frames, seed=options.seed, samples=options.samples, **task.fields
     )
     took = time.perf_counter() - began
-    print(f"{task.name}: {made.scenes * made.frames} frames in {took:.1f} s, seed {options.seed}")
+    seen = f", of which {made.scenes * made.context} are given," if made.context else ""
+    print(f"{task.name}: {made.scenes * made.frames} frames{seen} in {took:.1f} s, seed {options.seed}")
     from magnet.export import formats
 
     given, plain = made.context, made.plain()
@@ -145,6 +150,12 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
+
+
+def files_of(folder: Path) -> str:
+    """The first files of a folder that can be read, as they would be given; or what they would be."""
+    files = sorted(str(path) for path in folder.iterdir() if path.suffix.lower() in READ)
+    return " ".join(files[:2]) + (" ..." if len(files) > 2 else "") if files else "each person's .bvh or .npz"
 
 
 def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
@@ -196,19 +207,27 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
     if people > max(model.most_people, scene.agents):
         if not options.inputs and not options.context and options.task in (None, "generation"):
             return crowd_from_nothing(people, torch.Generator().manual_seed(options.seed)), ()
-        if options.context is None:
-            options.context = CONTEXT
-        if not options.context:
+        if options.context == 0:
             raise CommandError(
                 f"--context 0: a crowd goes on from frames of everybody; it begins with {CONTEXT} by itself"
             )
-        groups = [scene.slice(0, options.context)] if options.inputs else []
+        groups = [start_of_crowd(options, scene)] if options.inputs else []
+        options.context = options.context or (groups[0].frames if groups else CONTEXT)
         return model.start_crowd(people, groups, model.sampler.crowd_spacing, seed=options.seed), ()
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)
     present = scene.present.clone()
     present[:, list(added)] = True
     return scene.replace(present=present), added
+
+
+def start_of_crowd(options: argparse.Namespace, scene: Scene) -> Scene:
+    """The frames of the files that a crowd begins with: the first --context, or without it the last `CONTEXT`."""
+    if options.context is not None:
+        return scene.slice(0, options.context)
+    if scene.frames > CONTEXT:
+        print(f"the crowd begins with the last {CONTEXT} of {scene.frames} frames (--context T: with the first T)")
+    return scene.slice(max(scene.frames - CONTEXT, 0))
 
 
 def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:
@@ -255,27 +274,22 @@ def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
 
 def lengths(
     options: argparse.Namespace, choice: TaskChoice, scene: Scene, added: tuple[int, ...], model: Model
-) -> tuple[int, int]:
-    """Frames that are given of everybody, and frames after them.
+) -> tuple[Scene, int, int]:
+    """What is read of the files, its frames that are given of everybody, and frames after them.
+
+    A task that reads nothing of the recording after its context goes on from the end, so that nothing is thrown away.
 
     Raises:
         CommandError: the task reads motion that was not recorded.
         ValueError: the task makes no sense at these sizes.
     """
-    from magnet.motion.scene import FPS
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
 
     crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
-    context = options.context if options.context is not None else 0 if nothing else min(CONTEXT, recorded)
-    if options.inputs and not recorded:
-        raise CommandError(f"the files hold {scene.frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
-    if 0 < context < TOKEN_FRAMES:
-        raise CommandError(f"--context {context}: a token is {TOKEN_FRAMES} frames; give as many or more, or 0")
-    if context > recorded:
-        raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
+    context = context_of(options, scene.frames, recorded, nothing)
     rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
     tokens, steps = -(-(context + rest) // TOKEN_FRAMES), model.sampler.steps
     if added:  # planned with a past, for tasks that need one refuse to be planned without
@@ -286,5 +300,49 @@ def lengths(
                 "people to those that are there, generation makes everybody"
             )
     known = choice.task.schedule(Grid(tokens, scene.agents, context // TOKEN_FRAMES, steps)).known
-    reads = bool(known[context // TOKEN_FRAMES :].any())
-    return context, rest if options.frames or (reads and recorded > context) else FUTURE
+    if bool(known[context // TOKEN_FRAMES :].any()):
+        return scene, context, rest if options.frames or recorded > context else FUTURE
+    if bool(known.any()):  # of generation nothing is
+        scene, context = going_on(options, choice.name, scene, context, recorded)
+    return scene, context, options.frames or FUTURE
+
+
+def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing: bool) -> int:
+    """Frames that are given of everybody, in whole tokens, where the task reads what comes after them.
+
+    Args:
+        frames: of the files.
+        recorded: of these, in whole tokens.
+        nothing: what is not said is 0: somebody is made from nothing.
+
+    Raises:
+        CommandError: more than there is, or less than a token.
+    """
+    from magnet.motion.scene import FPS
+    from magnet.motion.tokens import TOKEN_FRAMES
+
+    if options.inputs and not recorded:
+        raise CommandError(f"the files hold {frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
+    context: int | None = options.context
+    if context is None:
+        return 0 if nothing else min(CONTEXT, recorded)
+    if 0 < context < TOKEN_FRAMES:
+        raise CommandError(f"--context {context}: a token is {TOKEN_FRAMES} frames; give as many or more, or 0")
+    whole = context // TOKEN_FRAMES * TOKEN_FRAMES
+    if whole > recorded or context > frames:
+        raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
+    if whole < context:
+        print(f"--context {context}: {whole} are given, for a token is {TOKEN_FRAMES} frames")
+    return whole
+
+
+def going_on(options: argparse.Namespace, task: str, scene: Scene, context: int, recorded: int) -> tuple[Scene, int]:
+    """What a task goes on from that reads nothing after its context: all of the files, unless --context says less."""
+    if options.context is None and recorded:
+        if recorded < scene.frames:
+            print(f"the first {scene.frames - recorded} of {scene.frames} frames are left out, to have whole tokens")
+        return scene.slice(scene.frames - recorded), recorded
+    if scene.frames > context and options.inputs:
+        unread = f"{scene.frames - context} of {scene.frames} recorded frames come after it and are not used"
+        print(f"--context {context}: {unread}; without it {task} goes on from the end")
+    return scene, context

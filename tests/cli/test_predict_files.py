@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -16,6 +18,8 @@ from magnet.tasks import registry
 from tests.cases import few, some_quick, some_slow
 
 QUICK = ["--sampler.steps", "2"]
+GOING_ON = ("joint_future", "partner_prediction", "agentic_sync", "agentic_async")
+"""Tasks that read nothing of a recording after its context."""
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +45,12 @@ def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> N
     out = tmp_path / "out.npz"
     said(capsys, *duet["bvh"], "--task", task, "--frames", "16", "--out", str(out), *QUICK)
     made, recorded = Scene.load(out), Scene.load(duet["ours"][0])
-    assert (made.frames, made.present.tolist()) == (48, [[True, True]])
+    frames = 48 + 16 if task in GOING_ON else 32 + 16
+    assert (made.frames, made.present.tolist()) == (frames, [[True, True]])
     assert made.given is not None
-    joints, truth = load_body().joints(made), load_body().joints(recorded)
-    given = made.given[0]
+    assert task not in GOING_ON or made.given[0].sum(dim=0).tolist() == [48, 48]
+    joints, truth = load_body().joints(made)[:, :48], load_body().joints(recorded)
+    given = made.given[0, :48]
     assert torch.isfinite(joints).all()
     assert given.any() == (task != "generation")
     assert (joints - truth)[0][given].abs().max() < 1e-3 if given.any() else True
@@ -66,6 +72,41 @@ def test_a_person_alone_gets_a_partner(duet, tmp_path, capsys) -> None:
     made, recorded, body = Scene.load(out), Scene.load(duet["ours"][0]), load_body()
     assert made.present.tolist() == [[True, True]]
     assert (body.joints(made)[0, :, 0] - body.joints(recorded)[0, :, 1]).abs().max() < 1e-3
+
+
+def test_what_goes_on_goes_on_from_the_end_of_the_recording(duet, tmp_path, capsys) -> None:
+    recorded = Scene.load(duet["ours"][0]).slice(0, 47)
+    recorded.save(tmp_path / "long.npz")
+    text = said(capsys, str(tmp_path / "long.npz"), "--frames", "4", "--out", str(tmp_path / "out.npz"), *QUICK)
+    assert "the first 3 of 47 frames are left out" in text and "48 frames, of which 44 are given" in text
+    made = Scene.load(tmp_path / "out.npz")
+    assert torch.equal(made.body_rot[:, :44], recorded.body_rot[:, 3:])
+
+
+@pytest.mark.parametrize(("context", "given", "unread"), [(38, 36, 12), (32, 32, 16), (48, 48, 0)])
+def test_a_context_is_of_whole_tokens_and_what_is_not_read_after_it_is_said(
+    context: int, given: int, unread: int, duet, tmp_path, capsys
+) -> None:
+    out = tmp_path / "out.npz"
+    text = said(capsys, *duet["ours"], "--context", str(context), "--frames", "4", "--out", str(out), *QUICK)
+    made, recorded = Scene.load(out), Scene.load(duet["ours"][0])
+    assert made.frames == given + 4
+    assert torch.equal(made.body_rot[:, :given], recorded.body_rot[:, :given])
+    assert (f"--context {context}: {given} are given" in text) == (given < context)
+    assert (f"{unread} of 48 recorded frames come after it and are not used" in text) == (unread > 0)
+
+
+def test_a_crowd_of_files_begins_with_their_last_second(duet, tmp_path, capsys) -> None:
+    text = said(capsys, *duet["ours"], "--people", "5", "--frames", "4", "--out", str(tmp_path / "crowd.npz"), *QUICK)
+    made, recorded = Scene.load(tmp_path / "crowd.npz"), Scene.load(duet["ours"][0])
+    assert "the crowd begins with the last 32 of 48 frames" in text and made.frames == 36
+    assert torch.equal(made.body_rot[:, :32, [2, 3]], recorded.body_rot[:, 16:])
+
+
+def test_a_folder_is_answered_by_the_files_in_it(duet, tmp_path, capsys) -> None:
+    folder = Path(duet["bvh"][0]).parent
+    assert cli.main(["predict", str(folder), "--out", str(tmp_path / "out.npz")]) == 2
+    assert f"{folder} is a folder: give its files, {duet['bvh'][0]} {duet['bvh'][1]}" in capsys.readouterr().err
 
 
 def test_a_short_file_is_given_whole(duet, tmp_path, capsys) -> None:
