@@ -121,7 +121,7 @@ def add_work(one: argparse.ArgumentParser) -> None:
     add("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
     add("--limit", type=int, default=None, help="largest number of takes per split, to try things out")
     add("--min_frames", type=int, default=30, help="shortest clip kept, at 30 fps (default: %(default)s)")
-    add("--up", default=None, help="the files' up axis, such as --up=+z; default: the data set's")
+    add("--up", default=None, help="the files' up axis: x, y, z, or --up=-z (default: the data set's)")
     add("--trust_fps", action="store_true", help="keep people who are too fast or slow for the frame rate")
 
 

@@ -63,5 +63,6 @@ def job_of(given: argparse.Namespace, name: str, root: str) -> PrepareJob:
     if given.body == "open" and given.bodies:
         families = families_of(registry.reader(name))
         given.body = str(find_bodies(given.bodies, families).get("neutral", "open"))
-    steps = CanonicalizeOptions(min_frames=given.min_frames, up=given.up, trust_fps=given.trust_fps)
+    up: Any = f"+{given.up}" if given.up in ("x", "y", "z") else given.up  # as `magnet export` takes it
+    steps = CanonicalizeOptions(min_frames=given.min_frames, up=up, trust_fps=given.trust_fps)
     return PrepareJob(name, root, options, given.body, steps, tuple(given.bodies))

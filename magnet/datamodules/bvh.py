@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
+from magnet.body.joints import HEAD, HIPS, JOINT_NAMES, NECK, PELVIS, SHOULDERS
 from magnet.datamodules.reading.arrays import AGAIN
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
@@ -42,6 +42,7 @@ class BvhTrack:
     joints: dict[str, str]
     worst: float
     said_fps: float
+    up: str | None = None  # its own axis, where files of one scene differ in it: the recording is y up then
 
     @property
     def fps(self) -> float:
@@ -77,7 +78,7 @@ class BvhTrack:
 
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
         """The person on `body`; fitted, unless the skeleton is the body's own."""
-        skeleton = self.resampled(fps).skeleton(up.lstrip("+"))
+        skeleton = self.resampled(fps).skeleton(self.up or up.lstrip("+"))
         scene, _ = onto(skeleton, body, self.worst, MOST_SHAPE)
         joints, theirs = _limbs(skeleton)
         off = body.joints(scene)[0, :, 0, joints] - torch.from_numpy(skeleton.at[:, theirs]).float()
@@ -143,18 +144,22 @@ class BVHReader(OwnReader[BvhTrack]):
     ) -> Recording:
         """Skeletons, and the joints by which axis, unit and rate are checked."""
         skeletons = [track.skeleton() for track in tracks]
+        axes = up_axes(skeletons)
+        differ = len(set(axes)) > 1
+        if differ:  # no one axis is all files': everybody is turned to y up by that of the own file
+            tracks = [replace(track, up=axis) for track, axis in zip(tracks, axes, strict=True)]
+            skeletons = [track.skeleton(track.up) for track in tracks]
         ours = [skeleton.naming.joints | {PELVIS: skeleton.chain[0]} for skeleton in skeletons]
         wanted = {PELVIS, HEAD, *LIMBS}
         joints = sorted(wanted.intersection(*ours))
-        axes: Counter[Axis] = Counter(_axis(skeleton.up) for skeleton in skeletons)
         said = dict.fromkeys(_said(track, skeleton) for track, skeleton in zip(tracks, skeletons, strict=True))
         places = [
-            skeleton.at[:, [numbers[joint] for joint in joints]] @ UP[skeleton.up]  # back to the file's axes
+            skeleton.at[:, [numbers[joint] for joint in joints]] @ UP["y" if differ else skeleton.up]  # the files' axes
             for skeleton, numbers in zip(skeletons, ours, strict=True)
         ]
         return Recording(
             fps=tracks[0].fps,
-            up=axes.most_common(1)[0][0],
+            up="+y" if differ else _axis(axes[0]),
             positions=np.stack(places, axis=1),
             joints=tuple(joints),
             persons=tuple(name or track.file.path.stem for name, track in zip(names, tracks, strict=True)),
@@ -162,6 +167,27 @@ class BVHReader(OwnReader[BvhTrack]):
             skeletons=tuple(tracks),
             said_fps=tracks[0].said_fps,
         )
+
+
+def up_axes(skeletons: Sequence[Skeleton]) -> list[str]:
+    """Up axis of each file of a scene, as its motion tells it.
+
+    Where they differ, whoever's rest pose stands as most others do may lie down: that one is in the others' world.
+    """
+    found = [skeleton.up for skeleton in skeletons]
+    if len(set(found)) == 1:
+        return found
+    rests = [_rest_axis(skeleton) for skeleton in skeletons]
+    most = Counter([*found, *rests]).most_common(1)[0][0]
+    return [most if rest == most else up for up, rest in zip(found, rests, strict=True)]
+
+
+def _rest_axis(skeleton: Skeleton) -> str:
+    """Where the torso points in the rest pose."""
+    rest, ours = skeleton.file.rest(), skeleton.naming.joints
+    torso = sum(rest[ours[joint]] for joint in SHOULDERS) - sum(rest[ours[joint]] for joint in HIPS)
+    axis = int(np.abs(torso).argmax())
+    return ("-" if torso[axis] < 0 else "") + "xyz"[axis]
 
 
 def _axis(up: str) -> Axis:

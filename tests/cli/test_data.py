@@ -94,6 +94,13 @@ def test_a_check_of_a_store_refuses_options_that_would_change_nothing(made, caps
     assert f"has no use for {words[0]}; leave it out" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("said", "up"), [(["--up", "z"], "+z"), (["--up=-z"], "-z"), ([], None)])
+def test_an_up_axis_may_be_said_as_for_export(said, up):
+    given = data.command_parser("check").parse_args(["dl", *said])
+    given.reader_options = []
+    assert data.job_of(given, "bvh", "dl").canonicalize.up == up
+
+
 def test_a_check_finds_another_body(copy, capsys):
     from magnet.datamodules.fakes.body import arrays
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from magnet.datamodules.fakes.motion import FakeMotion, people, turned
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.convert import convert
 from magnet.datamodules.reading.own import FEW
+from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import DataError, Reader
 from magnet.export.bvh import save_bvh
+from magnet.motion.rotations import from_rotvec
 from magnet.synthesis import synthesize
 
 TAKES, FRAMES = 4, 12
@@ -82,6 +85,44 @@ def test_files_of_different_rates_are_brought_together(tmp_path: Path) -> None:
     assert (found.fps, found.frames) == (30.0, 12)
     np.testing.assert_allclose(found.positions, true.positions[::4][:, :, list(found.joints)], atol=2e-3)
     assert "files of 60 and 120 frames a second, all brought to 30" in found.notes
+
+
+def mixed(root: Path) -> Path:
+    """Two people of one walk, the first's file z up and the second's y up."""
+    written(root, walk=walk(240))
+    written(root / "other", walk=turned(walk(240), "+y"))
+    (root / "other" / "walk_B.bvh").replace(root / "walk_B.bvh")
+    (root / "other" / "walk_A.bvh").unlink()
+    return root
+
+
+def test_files_of_different_up_axes_are_each_turned_by_their_own(tmp_path: Path) -> None:
+    reader = BVHReader(mixed(tmp_path / "dl"))
+    found, true = whole(reader), turned(walk(240), "+y")
+    assert found.up == "+y"
+    np.testing.assert_allclose(found.positions, true.positions[:, :, list(found.joints)], atol=1e-5)
+    assert {note.split("; ")[1] for note in found.notes} == {"cm, +z up, 120 fps", "cm, +y up, 120 fps"}
+    same = whole(BVHReader(written(tmp_path / "same", walk=true)))
+    one, other = (
+        canonicalize(each, load_body(), "walk", "bvh", "train", "positions", CanonicalizeOptions()).clips[0].scene
+        for each in (found, same)
+    )
+    assert (load_body().joints(one) - load_body().joints(other)).norm(dim=-1).max() < 1e-3
+
+
+def test_whoever_lies_beside_somebody_who_stands_is_in_the_same_world(tmp_path: Path) -> None:
+    root = written(tmp_path / "dl", walk=turned(walk(48), "+y"))
+    standing, lying = (BVHReader(root).open(PersonFile(name, root / f"walk_{name}.bvh"), False)[0][0] for name in "AB")
+    flat = from_rotvec(torch.tensor([0.0, 0.0, torch.pi / 2], dtype=torch.float64)).numpy()
+    local = lying.file.local.copy()
+    local[:, 0] = flat @ local[:, 0]
+    lying = replace(lying, file=replace(lying.file, local=local))
+    assert lying.skeleton().up == "-x"
+    for place, tracks in ((1, [standing, lying]), (0, [lying, standing])):
+        found = BVHReader(root).recording("walk", tracks, ("", ""), ())
+        assert found.up == "+y"
+        spread = np.ptp(found.positions[:, place], axis=1).mean(axis=0)
+        assert spread[0] > 1.2 > 0.8 > spread[1], "along x, and low"
 
 
 def test_people_alone_are_pointed_to_how_they_could_be_together(tmp_path: Path) -> None:
