@@ -42,6 +42,8 @@ Prepare, check, describe, fake and download data sets.
 """
 FAILED = 1
 """Exit code of a check that found a problem."""
+TUNED_HORIZON = 90
+"""Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -269,6 +271,7 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import registry
+    from magnet.datamodules.options import HELD_OUT
     from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
     from magnet.datamodules.preparing.progress import progress_bar
 
@@ -295,11 +298,21 @@ def run_prepare(given: argparse.Namespace) -> int:
     body = "" if given.body == "open" else f" --data.body_model {shlex.quote(given.body)}"
     place = shlex.quote(str(out))
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
+    longest = int(report.folder.split("test").frames.max(initial=0))
     if kind.own:
         tuned = f"magnet fit --config configs/finetune.yaml --data.path {place}{body}"
-        print(f"  {tuned}   # the shipped model goes on with it")
-    print(f"  {registry.fit_command(registry.data_of(kind))} --data.path {place}{body}")
+        print(f"  {tuned}{shorter_tests(longest, TUNED_HORIZON)}   # the shipped model goes on with it")
+    usual = f"{registry.fit_command(registry.data_of(kind))} --data.path {place}{body}"
+    print(f"  {usual}{shorter_tests(longest, HELD_OUT.horizon_frames)}")
     return 0
+
+
+def shorter_tests(longest: int, horizon: int) -> str:
+    """The option without which no test scene would fit into the longest test clip, for a command; "" where some do."""
+    from magnet.datamodules.options import HELD_OUT
+
+    rest = longest - HELD_OUT.context_frames
+    return f" --data.test.horizon_frames {rest}" if 0 < rest < horizon else ""
 
 
 def run_fake(given: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, Hel
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store.memory import MemoryStore, WindowIndex
 from magnet.datamodules.store.reader import StoreSplit
-from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows
+from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows, longest_stretch
 from magnet.motion.scene import Scene
 from magnet.seeding import derive
 
@@ -216,9 +216,14 @@ class MotionDataModule(LightningDataModule):
     def _some(self, split: Split, windows: WindowIndex, frames: int) -> WindowIndex:
         """The windows, of which there must be some."""
         if not len(windows):
+            store = self.store(split)
+            rest = longest_stretch(store) - self.test.context_frames
+            fewer = "ask for fewer frames"
+            if frames == self.test.frames and rest > 0:
+                fewer += f": --data.test.horizon_frames {rest} at most, after {self.test.context_frames} of context"
             raise ValueError(
                 f"{type(self).__name__}: split {split} has no clean stretch of {frames} frames; its longest clip has"
-                f" {int(self.store(split).length.max())}; ask for fewer frames"
+                f" {int(store.length.max())}; {fewer}"
             )
         return windows
 

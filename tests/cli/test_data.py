@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from magnet import cli
 from magnet.cli import data, data_options
@@ -99,6 +100,17 @@ def test_an_up_axis_may_be_said_as_for_export(said, up):
     given = data.command_parser("check").parse_args(["dl", *said])
     given.reader_options = []
     assert data.job_of(given, "bvh", "dl").canonicalize.up == up
+
+
+def test_tests_that_would_not_fit_into_the_takes_are_made_shorter_in_the_command(tmp_path, capsys):
+    config = yaml.safe_load((Path(__file__).parents[2] / "configs" / "finetune.yaml").read_text())
+    assert config["data"]["init_args"]["test"]["horizon_frames"] == data.TUNED_HORIZON
+    assert [data.shorter_tests(n, 90) for n in (0, 32, 121, 122)] == ["", "", " --data.test.horizon_frames 89", ""]
+    short = ["data", "fake", "bvh", str(tmp_path / "dl"), "--takes", "4", "--frames", "60"]
+    assert cli.main(short) == 0
+    words = ["--root", str(tmp_path / "dl"), "--workers", "1", str(tmp_path / "store")]
+    assert cli.main(["data", "prepare", "bvh", *words]) == 0
+    assert capsys.readouterr().out.count(" --data.test.horizon_frames 28") == 2
 
 
 def test_a_check_finds_another_body(copy, capsys):

@@ -254,6 +254,10 @@ def test_what_is_too_long_for_the_clips_is_named() -> None:
     data = FakeData([random_clip("a", 100, split="test"), random_clip("b", 100)])
     with pytest.raises(ValueError, match="no clean stretch of 182 frames; its longest clip has 100"):
         data.test_dataloader()
+    with pytest.raises(ValueError, match=r"--data\.test\.horizon_frames 68 at most, after 32 of context"):
+        data.test_dataloader()
+    fits = FakeData([random_clip("a", 100, split="test")], test=HeldOutScenes(horizon_frames=68))
+    assert next(iter(fits.test_dataloader())).frames == 100
     with pytest.raises(ValueError, match="no clean stretch of 150 frames"):
         data.train_scenes(150)
 

@@ -202,6 +202,16 @@ def spaced_starts(good: NDArray[np.bool_], frames: int, stride: int) -> Ints:
     return np.array(starts, dtype=np.int64)
 
 
+def longest_stretch(store: MemoryStore) -> int:
+    """Frames of the longest clean stretch of any clip."""
+    most = 0
+    for c in range(len(store.length)):
+        good = store.good(c)
+        ends = np.concatenate([[-1], np.flatnonzero(~good), [len(good)]])
+        most = max(most, int(np.diff(ends).max()) - 1)
+    return most
+
+
 def fixed_windows(store: MemoryStore, frames: int, stride: int, pad: bool = False) -> WindowIndex:
     """Clean windows of every clip in order, `stride` apart.
 
