@@ -138,11 +138,13 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
 
 
 def _rate(seconds: float, digits: int) -> float:
-    """Frames a second of a Frame Time that may have been rounded to few digits, such as 0.033."""
+    """Frames a second of a Frame Time that may have been rounded or cut to few digits, such as 0.033 or 0.0166."""
     fps = 1 / seconds
     if abs(round(fps) - fps) < 1e-6 * fps:
         return float(round(fps))
-    rounded = [rate for rate in RATES if 2 < digits < 5 and round(1 / rate, digits) == seconds]
+    near = RATES if 2 < digits < 5 else ()
+    rounded = [rate for rate in near if round(1 / rate, digits) == seconds]
+    rounded = rounded or [rate for rate in near if 10**digits // rate == round(seconds * 10**digits)]  # cut
     if rounded:
         return min(rounded, key=lambda rate: (rate != round(rate), abs(rate - fps)))
     nearest = min(RATES, key=lambda rate: abs(rate - fps))
