@@ -341,7 +341,8 @@ def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
             f"first{none}; {AGAIN}"
         )
     if not np.isfinite(whole).all():
-        raise DataError(f"{where}: rotations hold NaN or infinity; {AGAIN}")
+        out = "leave such frames out in all files of the scene"
+        raise DataError(f"{where}: rotations hold NaN or infinity; {out}, or {AGAIN}")
     return whole, whole.shape[-1]
 
 

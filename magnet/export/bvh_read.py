@@ -133,7 +133,8 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
     if not np.isfinite(values).all():
         frame = int((~np.isfinite(values).all(axis=1)).argmax())
         line = header.first + 1 + frame
-        raise ValueError(f"{path}:{line}: frame {frame + 1} holds NaN or infinity; leave such frames out")
+        out = "leave such frames out in all files of the scene"
+        raise ValueError(f"{path}:{line}: frame {frame + 1} holds NaN or infinity; {out}")
     return values
 
 

@@ -170,7 +170,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
         damaged(lambda h: h.update(trans=h["trans"][:-1])),
         r"unequal numbers of frames: rotations 40, translations 39",
     ),
-    "NaN": (damaged(lambda h: h["poses"].__setitem__((3, 4), np.nan)), r"rotations hold NaN"),
+    "NaN": (
+        damaged(lambda h: h["poses"].__setitem__((3, 4), np.nan)),
+        r"rotations hold NaN or infinity; leave such frames out in all files",
+    ),
     "few": (
         damaged(lambda h: h.update(poses=h["poses"][:, :40])),
         r"rotations: got shape \(40, 40\), expected \(frames, 66",
