@@ -35,10 +35,7 @@ class Bvh:
 
     def rest(self) -> Floats:
         """Joints in the rest pose, the root at the origin. (K, 3)"""
-        rest = np.zeros_like(self.offsets)
-        for k, parent in enumerate(self.parents):
-            rest[k] = 0.0 if parent < 0 else rest[parent] + self.offsets[k]
-        return rest
+        return _rest(self.offsets, self.parents)
 
     def world(self) -> tuple[Floats, Floats]:
         """Rotations from the rest pose (T, K, 3, 3) and positions (T, K, 3) in the file's world."""
@@ -55,8 +52,8 @@ class Bvh:
 def read_bvh(path: str | Path) -> Bvh:
     """Read one BVH file.
 
-    Position channels of a joint replace its OFFSET, as most programs write them; if they are nearer to zero than to
-    the OFFSET, they are added to it.
+    Position channels of a joint replace its OFFSET, as most programs write them, and are added to it where they
+    rather count from there: see `_added`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -75,6 +72,7 @@ def read_bvh(path: str | Path) -> Bvh:
     T, K = len(values), len(joints)
     place = np.broadcast_to(offsets, (T, K, 3)).copy()
     local = np.broadcast_to(np.eye(3), (T, K, 3, 3)).copy()
+    reach = float(np.linalg.norm(_rest(offsets, parents), axis=-1).max())
     column = 0
     for k, joint in enumerate(joints):
         moved = {}
@@ -86,18 +84,40 @@ def read_bvh(path: str | Path) -> Bvh:
                 local[:, k] = local[:, k] @ about(axis, np.radians(values[:, column]))
             column += 1
         if moved:
-            place[:, k] = _placed(offsets[k], moved, T)
+            place[:, k] = _placed(offsets[k], moved, T, reach)
     names = tuple(joint.name for joint in joints)
     return Bvh(names, parents, offsets, place, local, _rate(header.seconds, header.digits), path)
 
 
-def _placed(offset: Floats, moved: dict[int, Floats], frames: int) -> Floats:
+def _rest(offsets: Floats, parents: Sequence[int]) -> Floats:
+    rest = np.zeros_like(offsets)
+    for k, parent in enumerate(parents):
+        rest[k] = 0.0 if parent < 0 else rest[parent] + offsets[k]
+    return rest
+
+
+def _placed(offset: Floats, moved: dict[int, Floats], frames: int, reach: float) -> Floats:
     channels = np.zeros((frames, 3))
     for axis, values in moved.items():
         channels[:, axis] = values
+    return channels + offset if _added(offset, channels, reach) else channels
+
+
+def _added(offset: Floats, channels: Floats, reach: float) -> bool:
+    """Whether channels (T, 3) count from the OFFSET. reach: of the skeleton, in the file's unit
+
+    Not where they begin at the OFFSET. Else they do if nearer to zero than to it, as seen along the axis of least
+    movement: over the floor people go anywhere, but hips stay at about their height.
+    """
+    if len(channels) == 0 or np.linalg.norm(channels[0] - offset) <= 0.1 * np.linalg.norm(offset):
+        return False
     middle = np.median(channels, axis=0)
-    added = np.linalg.norm(middle) < np.linalg.norm(middle - offset)
-    return channels + offset if added else channels
+    telling = np.flatnonzero(np.abs(offset) >= 0.2 * reach)
+    if len(telling) and len(channels) > 1:
+        low, high = np.percentile(channels[:, telling], [10, 90], axis=0)
+        steady = telling[int((high - low).argmin())]
+        return bool(abs(middle[steady]) < abs(middle[steady] - offset[steady]))
+    return bool(np.linalg.norm(middle) < np.linalg.norm(middle - offset))
 
 
 def about(axis: int, radians: Floats) -> Floats:

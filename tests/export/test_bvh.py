@@ -107,6 +107,46 @@ def test_positions_that_repeat_the_offset_and_positions_added_to_it_are_told_apa
         assert at[0].tolist() == [[1, 2, 3], [1, 7, 3]]
 
 
+def walker(path: Path, offset: np.ndarray, channels: np.ndarray) -> Path:
+    """A hip and a leg of 90, moved by so many channels (T, 3)."""
+    rows = "\n".join(" ".join(f"{value:.4f}" for value in [*row, 0, 0, 0, 0, 0, 0]) for row in channels)
+    path.write_text(
+        f"HIERARCHY\nROOT hip {{\nOFFSET {' '.join(map(str, offset))}\n"
+        "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
+        "JOINT foot\n{\nOFFSET 0 -90 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+        f"End Site\n{{\nOFFSET 0 0 10\n}}\n}}\n}}\nMOTION\nFrames: {len(channels)}\nFrame Time: 0.1\n{rows}\n"
+    )
+    return path
+
+
+WALK = np.stack([np.linspace(180, -320, 60), 88 + 3 * np.sin(np.arange(60)), np.linspace(-40, 90, 60)], axis=1)
+OFFSETS = {
+    "the first frame": (WALK[0], False),
+    "the first frame of a longer take": (np.array([440.0, 91, -300]), False),
+    "the rest pose": (np.array([0.0, 90, 0]), False),
+    "the rest pose, where channels begin at zero": (np.array([10.0, 90, 5]), True),
+}
+
+
+@pytest.mark.parametrize("case", OFFSETS)
+def test_wherever_somebody_walks_a_root_offset_puts_nobody_elsewhere(case, tmp_path: Path):
+    offset, added = OFFSETS[case]
+    _, at = read_bvh(walker(tmp_path / "a.bvh", offset, WALK - offset if added else WALK)).world()
+    assert np.abs(at[:, 0] - WALK).max() < 1e-3
+
+
+def test_a_recording_stays_where_it_is_if_its_root_offset_repeats_the_first_frame(cmu_root: Path, tmp_path: Path):
+    file = cmu_root / "bvh" / "test__walking__walking_1.bvh"
+    if not file.is_file():
+        pytest.skip("no conversions of the recordings to BVH here")
+    plain = read_bvh(file)
+    first = " ".join(map(str, plain.place[0, 0]))
+    moved = tmp_path / "moved.bvh"
+    moved.write_text(re.sub(r"OFFSET 0 0 0", f"OFFSET {first}", file.read_text(), count=1))
+    assert read_bvh(moved).offsets[0].any()
+    assert np.array_equal(read_bvh(moved).world()[1], plain.world()[1])
+
+
 BREAKS = {
     "does not begin with HIERARCHY": lambda text: "garbage\n" + text,
     "has no MOTION part": lambda text: text[: text.index("MOTION")],
