@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.joints import HEAD, HIPS, JOINT_NAMES, NECK, PELVIS, SHOULDERS
+from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
 from magnet.datamodules.reading.arrays import AGAIN
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
@@ -21,7 +20,7 @@ from magnet.datamodules.reading.recording import Axis, DataError, Family, Record
 from magnet.datamodules.registry import register_reader
 from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto
-from magnet.export.rig import UP, Skeleton, understood
+from magnet.export.rig import UP, Skeleton, understood_together
 from magnet.motion.resample import resample_points, resample_rotations
 from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene
@@ -38,7 +37,7 @@ class BvhTrack:
     """One person's file: a skeleton with its motion, and the options it is read with."""
 
     file: Bvh
-    unit: Unit | None
+    unit: str | None
     joints: dict[str, str]
     worst: float
     said_fps: float
@@ -65,24 +64,25 @@ class BvhTrack:
         place = resample_points(torch.from_numpy(self.file.place), self.fps, fps).numpy()
         return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
 
-    def skeleton(self, up: str | None = None) -> Skeleton:
-        """The skeleton in metres, y up; the up axis is `up`, or is found from the motion.
-
-        Raises:
-            DataError: names, legs or the rest pose do not tell.
-        """
-        try:
-            return understood(self.file, self.unit, up, self.joints)
-        except ValueError as error:
-            raise DataError(str(error)) from error
-
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
         """The person on `body`; fitted, unless the skeleton is the body's own."""
-        skeleton = self.resampled(fps).skeleton(self.up or up.lstrip("+"))
+        (skeleton,) = _skeletons([self.resampled(fps)], self.up or up.lstrip("+"))
         scene, _ = onto(skeleton, body, self.worst, MOST_SHAPE)
         joints, theirs = _limbs(skeleton)
         off = body.joints(scene)[0, :, 0, joints] - torch.from_numpy(skeleton.at[:, theirs]).float()
         return scene, off.norm(dim=-1).mean(dim=-1)
+
+
+def _skeletons(tracks: Sequence[BvhTrack], up: str | None = None) -> list[Skeleton]:
+    """Skeletons of one scene in metres, y up; the up axis is `up`, or is found from the files.
+
+    Raises:
+        DataError: names, legs or the rest pose do not tell.
+    """
+    try:
+        return understood_together([track.file for track in tracks], tracks[0].unit, up, tracks[0].joints)
+    except ValueError as error:
+        raise DataError(str(error)) from error
 
 
 def _limbs(skeleton: Skeleton) -> tuple[list[int], list[int]]:
@@ -143,12 +143,10 @@ class BVHReader(OwnReader[BvhTrack]):
         self, where: str, tracks: Sequence[BvhTrack], names: Sequence[str], notes: Sequence[str]
     ) -> Recording:
         """Skeletons, and the joints by which axis, unit and rate are checked."""
-        skeletons = [track.skeleton() for track in tracks]
-        axes = up_axes(skeletons)
-        differ = len(set(axes)) > 1
+        skeletons = _skeletons(tracks)
+        differ = len({skeleton.up for skeleton in skeletons}) > 1
         if differ:  # no one axis is all files': everybody is turned to y up by that of the own file
-            tracks = [replace(track, up=axis) for track, axis in zip(tracks, axes, strict=True)]
-            skeletons = [track.skeleton(track.up) for track in tracks]
+            tracks = [replace(track, up=one.up) for track, one in zip(tracks, skeletons, strict=True)]
         ours = [skeleton.naming.joints | {PELVIS: skeleton.chain[0]} for skeleton in skeletons]
         wanted = {PELVIS, HEAD, *LIMBS}
         joints = sorted(wanted.intersection(*ours))
@@ -159,35 +157,14 @@ class BVHReader(OwnReader[BvhTrack]):
         ]
         return Recording(
             fps=tracks[0].fps,
-            up="+y" if differ else _axis(axes[0]),
+            up="+y" if differ else _axis(skeletons[0].up),
             positions=np.stack(places, axis=1),
             joints=tuple(joints),
             persons=tuple(name or track.file.path.stem for name, track in zip(names, tracks, strict=True)),
             notes=(*notes, *said),
-            skeletons=tuple(tracks),
+            skeletons=tuple(replace(track, unit=one.unit) for track, one in zip(tracks, skeletons, strict=True)),
             said_fps=tracks[0].said_fps,
         )
-
-
-def up_axes(skeletons: Sequence[Skeleton]) -> list[str]:
-    """Up axis of each file of a scene, as its motion tells it.
-
-    Where they differ, whoever's rest pose stands as most others do may lie down: that one is in the others' world.
-    """
-    found = [skeleton.up for skeleton in skeletons]
-    if len(set(found)) == 1:
-        return found
-    rests = [_rest_axis(skeleton) for skeleton in skeletons]
-    most = Counter([*found, *rests]).most_common(1)[0][0]
-    return [most if rest == most else up for up, rest in zip(found, rests, strict=True)]
-
-
-def _rest_axis(skeleton: Skeleton) -> str:
-    """Where the torso points in the rest pose."""
-    rest, ours = skeleton.file.rest(), skeleton.naming.joints
-    torso = sum(rest[ours[joint]] for joint in SHOULDERS) - sum(rest[ours[joint]] for joint in HIPS)
-    axis = int(np.abs(torso).argmax())
-    return ("-" if torso[axis] < 0 else "") + "xyz"[axis]
 
 
 def _axis(up: str) -> Axis:
@@ -203,7 +180,7 @@ def _said(track: BvhTrack, skeleton: Skeleton) -> str:
     unused = f"; not used: {', '.join(rest[:SHOWN])}{more}" if rest else ""
     return (
         f"names of {naming.scheme}, {len(naming.joints)} joints; {skeleton.unit}, {_axis(skeleton.up)} up, "
-        f"{track.said_fps:g} fps{unused}"
+        f"{track.said_fps:g} fps{unused}{''.join(f'; {note}' for note in skeleton.notes)}"
     )
 
 

@@ -22,7 +22,7 @@ from magnet.body.joints import (  # isort: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
-from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood
+from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood_together
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resampled
 from magnet.motion.scene import BODY_JOINTS, Scene, cat_agents
@@ -56,6 +56,7 @@ class Source:
     residual: float  # metres between limb joints and the file's, mean over joints and frames
     worst: str  # limb joint with the largest mean residual
     jumps: tuple[int, ...] = ()  # frames to which everything jumps
+    notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
 
     @property
     def poor(self) -> bool:
@@ -64,6 +65,7 @@ class Source:
     def __str__(self) -> str:
         how = "the body's own skeleton" if self.exact else f"names of {self.scheme}; {len(self.joints)} joints mapped"
         lines = [f"{self.path.name}: {how}; unit {self.unit}, {self.up} up"]
+        lines += [f"  {note}" for note in self.notes]
         if not self.exact:
             lines.append(f"  limbs lie {100 * self.residual:.1f} cm from the file's on average, most at {self.worst}")
             if self.poor:
@@ -104,8 +106,9 @@ def load_bvh(
     Args:
         fps: resample all files to this rate; None: the files' own rate, which must agree.
         trim: cut files of different lengths to the shortest.
-        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs.
-        up: `y`, `z`, `-y` ...; None: found from where the torso points.
+        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs, the same for all files
+            if one suits them all.
+        up: `y`, `z`, `-y` ...; None: found from where torsos point, and rest poses where somebody lies.
         joints: our joint's name to theirs, for names that no scheme knows.
         keep_floor: keep fitted people at the height they were recorded at.
 
@@ -127,7 +130,7 @@ def load_bvh(
         raise ValueError(
             f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
         )
-    skeletons = [understood(file, unit, up, joints) for file in files]
+    skeletons = understood_together(files, unit, up, joints)
     read = [onto(skeleton, body) for skeleton in skeletons]
     sources = tuple(replace(how, jumps=_jumps(each)) for (_, how), each in zip(read, skeletons, strict=True))
     labels = [str(path) for path in each]
@@ -224,6 +227,7 @@ def _source(
         exact=exact,
         residual=float(residual.mean()),
         worst=JOINT_NAMES[joints[int(residual.argmax())]],
+        notes=skeleton.notes,
     )
 
 

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from magnet.body.joints import HIPS, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS
 from magnet.export.bvh_read import Bvh
 from magnet.export.naming import Naming, recognised
+from magnet.export.upright import Stance, agreed, said, stance
 
 Floats = NDArray[np.float64]
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0.3048, "CMU's (1/0.45 inch)": 0.0254 / 0.45}
 SHORTEST_LEG, LONGEST_LEG = 0.6, 1.15
 """Metres from hip to ankle within which a unit is believed; no two units above fit one number."""
+CHILDS_LEG, GIANTS_LEG = 0.3, 1.3
+"""The same for people whose unit somebody else's file tells."""
 UP: dict[str, Floats] = {
     "y": np.eye(3),
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
@@ -45,10 +48,18 @@ class Skeleton:
     turned: Floats  # (T, K, 3, 3) world rotations from the file's rest pose, y up
     at: Floats  # (T, K, 3) world positions, metres, y up
     chain: tuple[int, ...]  # numbers of the pelvis, the spine and the chest, upwards
+    notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
 
 
 def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
-    """A file's skeleton in metres, y up, with our joints; options that are None are found from the file.
+    """As `understood_together`, one file."""
+    return understood_together([file], unit, up, given)[0]
+
+
+def understood_together(
+    files: Sequence[Bvh], unit: str | None, up: str | None, given: Mapping[str, str] | None
+) -> list[Skeleton]:
+    """Skeletons of one scene in metres, y up, with our joints; options that are None are found from the files.
 
     Args:
         given: our joint's name to theirs, for names that no scheme knows.
@@ -56,27 +67,82 @@ def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, 
     Raises:
         ValueError: unknown names, a length of legs that fits no unit, or a rest pose without a front.
     """
+    namings = [_named(file, given) for file in files]
+    legs = [_leg(file.rest(), naming.joints) for file, naming in zip(files, namings, strict=True)]
+    units = _units(files, legs) if unit is None else [unit] * len(files)
+    moved = [file.world() for file in files]
+    stances = [_stance(*each) for each in zip(files, namings, legs, [at for _, at in moved], strict=True)]
+    ups = agreed(stances) if up is None else [up] * len(files)
+    found = []
+    for k, (file, naming) in enumerate(zip(files, namings, strict=True)):
+        notes = [] if unit else _of_unit(legs, units, k)
+        notes += [] if up else said(stances, ups, k)
+        found.append(_skeleton(file, naming, units[k], ups[k], *moved[k], tuple(notes)))
+    return found
+
+
+def _named(file: Bvh, given: Mapping[str, str] | None) -> Naming:
     naming = recognised(file.names, given)
     if naming.missing:
         raise ValueError(
             f"{file.path}: cannot tell which joint is {', '.join(naming.missing)}; it has {', '.join(file.names)}. "
             f"Name them: --joint {naming.missing[0]}=ITS_NAME (joints={{...}}; of magnet data: --reader.joints FILE)"
         )
-    ours = naming.joints
-    rest = file.rest()
-    leg = np.mean([sum(np.linalg.norm(rest[ours[a + s]] - rest[ours[b + s]]) for a, b in LIMBS[:2]) for s in (0, 1)])
-    if unit is None:
-        fitting = [name for name, metres in UNITS.items() if SHORTEST_LEG <= leg * metres <= LONGEST_LEG]
-        if not fitting:
-            raise ValueError(
-                f"{file.path}: legs are {leg:.3g} long, which fits no unit of length; say --in_unit m or cm (unit=...; "
-                "of magnet data: --reader.unit)"
-            )
-        unit = fitting[0]
-    turned, at = file.world()
-    torso = _middle(at, ours, 16, 17) - _middle(at, ours, 1, 2)
-    up = up or _up_axis(torso, rest, ours)
-    M = UP[up]
+    return naming
+
+
+def _leg(rest: Floats, ours: Mapping[int, int]) -> float:
+    """Length of a leg in the file's unit."""
+    bones = [rest[ours[a + s]] - rest[ours[b + s]] for a, b in LIMBS[:2] for s in (0, 1)]
+    return float(np.linalg.norm(bones, axis=-1).sum()) / 2
+
+
+def _units(files: Sequence[Bvh], legs: Sequence[float]) -> list[str]:
+    """One unit for all, which fits most legs and makes the others a child's or a giant's; else each file's own."""
+
+    def fits(leg: float, unit: str, low: float = SHORTEST_LEG, high: float = LONGEST_LEG) -> bool:
+        return low <= leg * UNITS[unit] <= high
+
+    shared = [unit for unit in UNITS if all(fits(leg, unit, CHILDS_LEG, GIANTS_LEG) for leg in legs)]
+    unit = max(shared, key=lambda unit: sum(fits(leg, unit) for leg in legs), default=None)
+    if unit is not None and any(fits(leg, unit) for leg in legs):
+        return [unit] * len(files)
+    own = [next((unit for unit in UNITS if fits(leg, unit)), "") for leg in legs]
+    if "" in own:
+        k = own.index("")
+        raise ValueError(
+            f"{files[k].path}: legs are {legs[k]:.3g} long, which fits no unit of length; say --in_unit m or cm "
+            "(unit=...; of magnet data: --reader.unit)"
+        )
+    return own
+
+
+def _of_unit(legs: Sequence[float], units: Sequence[str], k: int) -> list[str]:
+    leg = legs[k] * UNITS[units[k]]
+    if len(set(units)) > 1:
+        return [f"files have different units, this one {units[k]}"]
+    if not SHORTEST_LEG <= leg <= LONGEST_LEG:
+        return [f"legs are {100 * leg:.0f} cm long if its unit is that of the others, which is taken to be so"]
+    return []
+
+
+def _stance(file: Bvh, naming: Naming, leg: float, at: Floats) -> Stance:
+    ours, rest = naming.joints, file.rest()
+    ankles = (rest[ours[L_ANKLE]] + rest[ours[L_ANKLE + 1]]) / 2
+    known = at[:, sorted(ours.values())] / max(leg, 1e-9)
+    return stance(
+        _middle(at, ours, *SHOULDERS) - _middle(at, ours, *HIPS),
+        known,
+        _middle(at, ours, *HIPS) / max(leg, 1e-9),
+        _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS),
+        (ankles - _middle(rest, ours, *HIPS)) / max(leg, 1e-9),
+    )
+
+
+def _skeleton(
+    file: Bvh, naming: Naming, unit: str, up: str, turned: Floats, at: Floats, notes: tuple[str, ...]
+) -> Skeleton:
+    ours, M = naming.joints, UP[up]
     pelvis = _ancestor(file.parents, [ours[1], ours[2]])
     chest = _ancestor(file.parents, [ours[16], ours[17]])
     chain = [chest]
@@ -88,24 +154,16 @@ def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, 
         unit=unit,
         up=up,
         metres=UNITS[unit],
-        R_rest_ours=_rest_frame(rest, ours, file.path),
+        R_rest_ours=_rest_frame(file.rest(), ours, file.path),
         turned=M @ turned,
         at=UNITS[unit] * (at @ M.T),
         chain=tuple(reversed(chain)) if chain[-1] == pelvis else (pelvis,),
+        notes=notes,
     )
 
 
 def _middle(at: Floats, ours: Mapping[int, int], a: int, b: int) -> Floats:
     return (at[..., ours[a], :] + at[..., ours[b], :]) / 2
-
-
-def _up_axis(torso: Floats, rest: Floats, ours: Mapping[int, int]) -> str:
-    """Where torsos point on average, or in the rest pose if people lie down. torso (T, 3)"""
-    mean = (torso / np.linalg.norm(torso, axis=-1, keepdims=True)).mean(axis=0)
-    if np.abs(mean).max() < 0.7:
-        mean = _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS)
-    axis = int(np.abs(mean).argmax())
-    return ("-" if mean[axis] < 0 else "") + "xyz"[axis]
 
 
 def _rest_frame(rest: Floats, ours: Mapping[int, int], path: Path) -> Floats:

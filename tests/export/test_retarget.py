@@ -19,9 +19,10 @@ from magnet.datamodules.preparing.fit_cache import fit_whole
 from magnet.datamodules.reading.asf_amc import AmcRecording, read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import measured
 from magnet.export import load_bvh, save_bvh
+from magnet.export.bvh_read import read_bvh
 from magnet.export.naming import recognised
 from magnet.export.retarget import Imported
-from magnet.export.rig import UP
+from magnet.export.rig import UP, understood_together
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -118,6 +119,57 @@ def test_a_person_comes_back_from_any_rig(case, truth: Truth, body: Body, tmp_pa
     distance, angle = errors(found, truth, body)
     assert distance[LIMBS].max() < 0.015 and distance.max() < 0.04
     assert angle[LIMBS].max() < 12 and angle.mean() < 7
+
+
+def person(
+    truth: Truth, body: Body, path: Path, about: float = 0.0, walk: float = 0.0, bones: float = 1.0, **how
+) -> Path:
+    """The standing person, turned about z by so many degrees (90: lies, the head at -x), who walks along x or not."""
+    R = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, np.radians(about)], dtype=torch.float64))
+    root = truth.scene.T_world_root[0, :, 0, :3, 3] * torch.tensor([0.02, 1.0, 0.02])
+    root = R @ (root.double() + torch.linspace(0, walk, len(root))[:, None] * torch.eye(3)[0])[..., None]
+    rest_world, rest_at = turned(body, pose(70, 0), torch.eye(4), truth.scene.betas[0, 0])
+    arrays = [t.double().numpy() for t in (R @ truth.world.double(), rest_world, bones * rest_at, root[..., 0])]
+    return strangers.rerigged(path, strangers.NAMINGS["mixamo"], JOINT_NAMES, PARENTS, *arrays, fps=30.0, **how)
+
+
+def axes(*files: Path, **options: str) -> list[str]:
+    """Which axis is taken for up in each file of a scene."""
+    return [one.up for one in understood_together([read_bvh(f) for f in files], None, options.get("up"), None)]
+
+
+def test_whoever_lies_throughout_is_not_stood_up(truth: Truth, body: Body, tmp_path: Path):
+    stands = person(truth, body, tmp_path / "stands.bvh", metres=0.01)
+    lies = person(truth, body, tmp_path / "lies.bvh", about=90, metres=0.01)
+    assert axes(stands, lies) == ["y", "y"] and axes(lies) == ["y"]
+    assert axes(stands, lies, up="-x") == ["-x", "-x"]
+    alone, beside = understood_together([read_bvh(lies), read_bvh(stands)], None, None, None)
+    assert len(alone.notes) == 1 and "torsos point along -x" in alone.notes[0] and not beside.notes
+
+
+def test_files_of_two_axes_in_which_people_stand_are_read_and_told_of(truth: Truth, body: Body, tmp_path: Path):
+    y, z = (person(truth, body, tmp_path / f"{up}.bvh", up=UP[up].T) for up in "yz")
+    assert axes(y, z) == ["y", "z"]
+    notes = [one.notes for one in understood_together([read_bvh(y), read_bvh(z)], None, None, None)]
+    assert all("files have different axes" in note for (note,) in notes)
+
+
+def test_a_world_turned_after_the_rest_pose_is_seen_where_somebody_walks(truth: Truth, body: Body, tmp_path: Path):
+    """Whoever lies with the head at -x does not move along y."""
+    assert axes(person(truth, body, tmp_path / "a.bvh", about=90, walk=2.0)) == ["-x"]
+
+
+def test_a_child_is_measured_in_the_unit_of_the_grown_up(truth: Truth, body: Body, tmp_path: Path):
+    grown = person(truth, body, tmp_path / "grown.bvh", metres=0.01)
+    child = person(truth, body, tmp_path / "child.bvh", metres=0.01, bones=0.42)
+    first, second = understood_together([read_bvh(grown), read_bvh(child)], None, None, None)
+    assert (first.unit, second.unit) == ("cm", "cm") and not first.notes
+    assert len(second.notes) == 1 and "cm long if its unit is that of the others" in second.notes[0]
+    metres = person(truth, body, tmp_path / "metres.bvh")
+    found = understood_together([read_bvh(grown), read_bvh(metres)], None, None, None)
+    assert [one.unit for one in found] == ["cm", "m"]
+    assert all("different units" in note for one in found for note in one.notes)
+    assert {one.unit for one in understood_together([read_bvh(grown), read_bvh(child)], "inch", None, None)} == {"inch"}
 
 
 @pytest.mark.slow

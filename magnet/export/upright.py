@@ -1,0 +1,143 @@
+"""Which axis points up for all files of a scene, where some of their people may lie throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+CLEAR, LONG = 0.95, 0.7
+"""Least share of an axis in a torso that rests along it, and in the mean torso of a take."""
+MOST_RISEN = 0.5
+"""Leg lengths that the pelvis of somebody who lies throughout rises or sinks at most."""
+SAME_FLOOR = 0.15
+"""Leg lengths by which floors of people in files of different axes must fit better than those in files of one."""
+
+
+@dataclass(frozen=True)
+class Stance:
+    """What a person tells of the axis that points up; lengths in legs."""
+
+    torso: str  # axis along which torsos point most
+    shown: str | None  # the same, if they do for long
+    rest: str | None  # axis along which the rest pose stands, if it clearly does
+    moved: Floats  # (3,) range of the pelvis along x, y and z
+    low: Floats  # (3, 2) where the lowest joint is if x, y, z or -x, -y, -z points up; median over frames
+
+    def may_lie(self, up: str) -> bool:
+        """Whether somebody who does not stand along this axis may lie all the time."""
+        return bool(self.moved["xyz".index(up[-1])] <= MOST_RISEN)
+
+    def floor(self, up: str) -> float:
+        """Leg lengths of the lowest joint over zero."""
+        return float(self.low["xyz".index(up[-1]), int(up.startswith("-"))])
+
+
+def stance(
+    torso: Floats, at: Floats, pelvis: Floats, resting: Floats | None = None, legs: Floats | None = None
+) -> Stance:
+    """What one person's motion tells, and the rest pose, if there is one.
+
+    Args:
+        torso: (T, 3) upwards, of any length.
+        at: (T, K, 3) joints, in leg lengths.
+        pelvis: (T, 3) the same.
+        resting: (3,) the torso of the rest pose, of any length.
+        legs: (3,) from hips to ankles there, in leg lengths.
+    """
+    rest = _standing(resting, legs)
+    if len(torso) == 0:
+        return Stance(rest or "y", None, rest, np.zeros(3), np.zeros((3, 2)))
+    mean = (torso / np.linalg.norm(torso, axis=-1, keepdims=True).clip(1e-9)).mean(axis=0)
+    along = axis_of(mean)
+    low, high = np.percentile(pelvis, [5, 95], axis=0)
+    floors = [np.median(at.min(axis=1), axis=0), np.median((-at).min(axis=1), axis=0)]
+    shown = along if np.abs(mean).max() >= LONG else None
+    if shown is None and resting is not None:
+        along = axis_of(resting)
+    return Stance(along, shown, rest, high - low, np.stack(floors, axis=1))
+
+
+def _standing(torso: Floats | None, legs: Floats | None) -> str | None:
+    """The axis along which a rest pose clearly stands: its torso points along it, and its legs the other way."""
+    if torso is None or legs is None:
+        return None
+    up = axis_of(torso)
+    axis, sign = "xyz".index(up[-1]), -1 if up.startswith("-") else 1
+    stands = sign * torso[axis] >= CLEAR * np.linalg.norm(torso) and -sign * legs[axis] >= LONG
+    return up if stands else None
+
+
+def axis_of(vector: Floats) -> str:
+    """The axis that is nearest to a direction, such as `-z`."""
+    axis = int(np.abs(vector).argmax())
+    return ("-" if vector[axis] < 0 else "") + "xyz"[axis]
+
+
+def agreed(stances: Sequence[Stance]) -> list[str]:
+    """The axis that points up in each file of one scene; files of different programs may have different ones.
+
+    A rest pose counts where the motion contradicts it: somebody may lie. Whoever's rest pose does not tell has the
+    axis of the others, unless they move up and down along it as nobody does who lies.
+    """
+    sure = {one.rest for one in stances if one.rest is not None and one.rest == one.shown}
+    found = [_rested(one, sure) for one in stances]
+    axes = sorted({axis for axis in found if axis is not None})
+    if not axes:
+        return _without_rest(stances)
+    pairs = list(zip(stances, found, strict=True))
+    ground = float(np.median([one.floor(axis) for one, axis in pairs if axis is not None]))
+    return [_beside(one, axes, ground) if axis is None else axis for one, axis in pairs]
+
+
+def _rested(one: Stance, sure: set[str]) -> str | None:
+    """By the rest pose, beside files of which the axis is sure; None: it does not tell."""
+    if one.rest is None:
+        return None
+    for axis in (one.rest, one.shown):
+        if axis in sure:
+            return axis
+    # A world that was turned after the rest pose: whoever stands there walks along what the rest pose calls up.
+    return one.rest if one.shown is None or one.may_lie(one.rest) else one.shown
+
+
+def _beside(one: Stance, axes: Sequence[str], ground: float) -> str:
+    """For somebody whose rest pose does not tell, by the axes of the others and their floor."""
+    if one.torso in axes or len(axes) > 1 or (one.shown is not None and not one.may_lie(axes[0])):
+        return one.torso
+    off, own = (abs(one.floor(up) - ground) for up in (axes[0], one.torso))
+    return axes[0] if one.shown is None or off <= own + SAME_FLOOR else one.torso
+
+
+def _without_rest(stances: Sequence[Stance]) -> list[str]:
+    """By motion alone: one axis for all if whoever does not stand along it may lie, and floors do not contradict."""
+    own = [one.torso for one in stances]
+    axes = sorted(set(own), key=lambda axis: (-own.count(axis), axis[-1] != "y", axis))
+    if len(axes) == 1:
+        return own
+
+    def apart(ups: Sequence[str]) -> float:
+        floors = [one.floor(up) for one, up in zip(stances, ups, strict=True)]
+        return max(floors) - min(floors)
+
+    may = [axis for axis in axes if all(one.torso == axis or one.may_lie(axis) for one in stances)]
+    one_for_all = min(([axis] * len(own) for axis in may), key=apart, default=own)
+    return one_for_all if apart(one_for_all) <= apart(own) + SAME_FLOOR else own
+
+
+def said(stances: Sequence[Stance], ups: Sequence[str], k: int) -> list[str]:
+    """What was decided for a file against its people's motion, or beside files of other axes."""
+    shown = stances[k].shown
+    notes = []
+    if shown is not None and shown != ups[k]:
+        why = "the rest pose" if stances[k].rest == ups[k] else "the other people"
+        notes.append(f"torsos point along {shown}, so this person lies, as {ups[k]} points up for {why}; else say --up")
+    elif shown is not None and stances[k].rest not in (None, ups[k]):
+        notes.append(f"the rest pose stands along {stances[k].rest}, but people stand and walk along {ups[k]}")
+    if len(set(ups)) > 1:
+        notes.append(f"files have different axes that point up, this one {ups[k]}; if all have the same, say --up")
+    return notes
