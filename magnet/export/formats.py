@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,10 @@ from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
-from magnet.export.npz import each_of, read_smplx, require_rate, save_smplx
+from magnet.export.npz import each_of, read_smplx, require_rate, save_smplx, stance_in
 from magnet.export.retarget import load_bvh, together
 from magnet.export.smpl_keys import posed
+from magnet.export.upright import agreed, said
 from magnet.export.usd import require_usd, save_usd
 from magnet.files import load_npz, regular
 from magnet.motion.resample import resampled
@@ -105,12 +106,11 @@ def read(
             way = "lowered" if imported.floor > 0 else "raised"
             notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
-    scenes, notes, foreign = [], [], []
-    for file in files:
-        scene, note, strange = _read_npz(file, body, options)
-        scenes.append(scene)
-        notes += note
-        foreign.append(strange)
+    people = [_read_npz(file, body, options) for file in files]
+    if len(people) > 1 and options.up is None:
+        people = _of_one_axis(files, people, body, options)
+    scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
+    notes = [note for one in people for note in one.notes]
     if len(scenes) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
         return _grounded(scene, body, notes, () if options.keep_floor else foreign)
@@ -133,8 +133,8 @@ def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[
         metres = float((scene.T_world_root - moved.T_world_root)[..., 1, 3].mean()) if scene.T_world_root.numel() else 0
         if abs(metres) >= UNSEEN:
             way = "lowered" if metres > 0 else "raised"
-            said = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
-            notes = [*notes, f"everybody was {way} by {said} onto the floor; --keep_floor leaves them"]
+            far = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
+            notes = [*notes, f"everybody was {way} by {far} onto the floor; --keep_floor leaves them"]
         return Read(moved, body, tuple(notes))
     return Read(scene, body, (*notes, *_floor_note(scene, body)))
 
@@ -147,8 +147,31 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
     return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
 
 
-def _read_npz(path: Path, body: Body, options: Reading) -> tuple[Scene, list[str], bool]:
-    """A scene of ours or SMPL-X's keys, told apart by what they hold; notes; whether other programs wrote it."""
+@dataclass(frozen=True)
+class _Npz:
+    """A scene of ours or SMPL-X's keys, told apart by what they hold."""
+
+    scene: Scene
+    notes: list[str]
+    foreign: bool  # another program wrote it
+    up: str  # axis of the file
+
+
+def _of_one_axis(files: Sequence[Path], people: Sequence[_Npz], body: Body, options: Reading) -> list[_Npz]:
+    """Files of one scene read with the axis that suits them together: somebody may lie in one of them."""
+    if len({one.up for one in people}) == 1 or any(one.scene.scenes != 1 for one in people):
+        return list(people)
+    stances = [stance_in(one.scene, body, one.up, not one.foreign) for one in people]
+    ups = agreed(stances)
+    read = []
+    for k, (file, one) in enumerate(zip(files, people, strict=True)):
+        again = one if ups[k] == one.up else _read_npz(file, body, replace(options, up=ups[k]))
+        read.append(replace(again, notes=[*again.notes, *(f"{file.name}: {note}" for note in said(stances, ups, k))]))
+    return read
+
+
+def _read_npz(path: Path, body: Body, options: Reading) -> _Npz:
+    """A scene of ours or SMPL-X's keys, and how it was read."""
     up, unit = options.up, options.unit
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
@@ -170,7 +193,7 @@ def _read_npz(path: Path, body: Body, options: Reading) -> tuple[Scene, list[str
             raise ValueError(
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
             )
-        return scene, [], False
+        return _Npz(scene, [], False, "y")
     scene, found = read_smplx(path, body, up, unit, options.in_fps)
     note, ours = [], {"body", "surface_model_type"} <= keys
     if up is None and found not in ("y", "z"):
@@ -179,7 +202,7 @@ def _read_npz(path: Path, body: Body, options: Reading) -> tuple[Scene, list[str
         note.append(
             f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
         )
-    return scene, note, not ours
+    return _Npz(scene, note, not ours, found)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from magnet.export.smpl_keys import (
     first_of,
     rotations,
 )
+from magnet.export.upright import Stance, axis_of, stance
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -204,9 +205,17 @@ def _require_metres(path: str | Path, T_world_root: Tensor) -> None:
 
 def _standing(T_world_root: Tensor) -> str:
     """The axis of a file's world that points up, by where pelvises do. (P, T, 4, 4) -> a key of `UP`"""
-    up = T_world_root[..., :3, 1].mean(dim=(0, 1))
-    axis = int(up.abs().argmax())
-    return "-" * bool(up[axis] < 0) + "xyz"[axis]
+    return axis_of(T_world_root[..., :3, 1].mean(dim=(0, 1)).numpy())
+
+
+def stance_in(scene: Scene, body: Body, up: str, sure: bool) -> Stance:
+    """What the people of a file tell of its axis that points up, which was found as `up` or is known for sure."""
+    M, leg = UP[up], float(body.rest_joints(torch.zeros(10))[[1, 7], 1].diff().abs())
+    joints = body.joints(scene)[0].double().numpy() @ M / leg  # in the file's axes
+    torso = scene.T_world_root[0, ..., :3, 1].double().numpy() @ M
+    each = [stance(torso[:, p], joints[:, p], joints[:, p, 0]) for p in range(scene.agents)]
+    moved = np.max([one.moved for one in each], axis=0)
+    return Stance(up, up, up if sure else None, moved, np.min([one.low for one in each], axis=0))
 
 
 HIGHEST, MOST_TURNED = 30.0, 9.0

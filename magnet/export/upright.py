@@ -12,10 +12,8 @@ Floats = NDArray[np.float64]
 
 CLEAR, LONG = 0.95, 0.7
 """Least share of an axis in a torso that rests along it, and in the mean torso of a take."""
-MOST_RISEN = 0.5
-"""Leg lengths that the pelvis of somebody who lies throughout rises or sinks at most."""
-SAME_FLOOR = 0.15
-"""Leg lengths by which floors of people in files of different axes must fit better than those in files of one."""
+MOST_RISEN = 0.25
+"""Leg lengths between the heights of a pelvis in most frames (15 to 85 %) of somebody who lies, at most."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class Stance:
     torso: str  # axis along which torsos point most
     shown: str | None  # the same, if they do for long
     rest: str | None  # axis along which the rest pose stands, if it clearly does
-    moved: Floats  # (3,) range of the pelvis along x, y and z
+    moved: Floats  # (3,) how far the pelvis goes along x, y and z in the most frames: a range of percentiles
     low: Floats  # (3, 2) where the lowest joint is if x, y, z or -x, -y, -z points up; median over frames
 
     def may_lie(self, up: str) -> bool:
@@ -54,7 +52,7 @@ def stance(
         return Stance(rest or "y", None, rest, np.zeros(3), np.zeros((3, 2)))
     mean = (torso / np.linalg.norm(torso, axis=-1, keepdims=True).clip(1e-9)).mean(axis=0)
     along = axis_of(mean)
-    low, high = np.percentile(pelvis, [5, 95], axis=0)
+    low, high = np.percentile(pelvis, [15, 85], axis=0)
     floors = [np.median(at.min(axis=1), axis=0), np.median((-at).min(axis=1), axis=0)]
     shown = along if np.abs(mean).max() >= LONG else None
     if shown is None and resting is not None:
@@ -110,7 +108,7 @@ def _beside(one: Stance, axes: Sequence[str], ground: float) -> str:
     if one.torso in axes or len(axes) > 1 or (one.shown is not None and not one.may_lie(axes[0])):
         return one.torso
     off, own = (abs(one.floor(up) - ground) for up in (axes[0], one.torso))
-    return axes[0] if one.shown is None or off <= own + SAME_FLOOR else one.torso
+    return axes[0] if one.shown is None or off <= own else one.torso
 
 
 def _without_rest(stances: Sequence[Stance]) -> list[str]:
@@ -126,7 +124,7 @@ def _without_rest(stances: Sequence[Stance]) -> list[str]:
 
     may = [axis for axis in axes if all(one.torso == axis or one.may_lie(axis) for one in stances)]
     one_for_all = min(([axis] * len(own) for axis in may), key=apart, default=own)
-    return one_for_all if apart(one_for_all) <= apart(own) + SAME_FLOOR else own
+    return one_for_all if apart(one_for_all) <= apart(own) else own
 
 
 def said(stances: Sequence[Stance], ups: Sequence[str], k: int) -> list[str]:

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from magnet import cli
 from magnet.body import Body, load_body, on_floor
 from magnet.body.joints import JOINT_NAMES
-from magnet.export import formats, resampled
+from magnet.export import formats, resampled, save_smplx
+from magnet.export.rig import UP
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -176,6 +177,37 @@ def test_pictures_mark_what_the_scene_says_was_given_at_any_rate(duet: Scene, bo
 
 
 # -- the floor ---------------------------------------------------------------------------------
+
+
+def by_another_program(scene: Scene, person: int, path: Path, body: Body, up: str = "y", lies: bool = False) -> Path:
+    """One person as AMASS writes people; whoever lies has the head at +z and the back on y = 0."""
+    (made,) = save_smplx(scene.permute_agents(torch.tensor([person])), path, body)
+    with np.load(made) as file:
+        arrays = {key: file[key] for key in ("poses", "trans", "mocap_frame_rate")}
+    turn = Rotation.from_matrix(UP["z" if lies else up].T)
+    rest = body.rest_joints(torch.zeros(10))[0].double().numpy()
+    poses, pelvis = arrays["poses"][0].copy(), turn.apply(arrays["trans"][0] + rest) + lies * np.array([0, 0.4, -1])
+    poses[:, :3] = (turn * Rotation.from_rotvec(poses[:, :3])).as_rotvec()
+    np.savez(made, poses=poses, trans=pelvis - rest, mocap_frame_rate=arrays["mocap_frame_rate"])
+    return made
+
+
+def test_whoever_lies_in_an_npz_beside_somebody_who_stands_stays_lying(duet: Scene, body: Body, tmp_path: Path):
+    """As long as nobody walks, floors tell: a standing person's is where the other lies."""
+    T_world_root = duet.T_world_root.clone()
+    T_world_root[..., 2, 3] = 0.3 * T_world_root[..., 2, 3] + 0.1
+    still = duet.replace(T_world_root=T_world_root, betas=torch.zeros_like(duet.betas))
+    stands = by_another_program(still, 0, tmp_path / "stands.npz", body)
+    lies = by_another_program(still, 1, tmp_path / "lies.npz", body, lies=True)
+    got = formats.read([stands, lies], body)
+    torso = got.scene.T_world_root[0, :, :, :3, 1].mean(dim=0)
+    assert torso[0, 1] > 0.8 and torso[1, 2] > 0.8
+    assert any("lies.npz: torsos point along z, so this person lies" in note for note in got.notes)
+    assert formats.read([stands, lies], body, formats.Reading(up="z")).scene.T_world_root[0, :, 1, 1, 1].mean() > 0.8
+    other = by_another_program(still, 1, tmp_path / "z.npz", body, up="z")
+    both = formats.read([stands, other], body)
+    assert (both.scene.T_world_root[0, :, :, 1, 1].mean(dim=0) > 0.8).all()
+    assert sum("files have different axes" in note for note in both.notes) == 2
 
 
 def upstairs(duet: Scene, path: Path, body: Body, ours: bool) -> Path:
