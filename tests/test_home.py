@@ -13,8 +13,11 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+
+from magnet.evaluation.scoring import TRUTH
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -69,8 +72,21 @@ def test_hooks_before_commits_keep_recordings_out() -> None:
     }
     assert {"ruff", "ruff-format", "mypy", "no-recordings"} <= set(hooks)
     refused = re.compile(hooks["no-recordings"]["files"])
-    assert all(refused.search(name) for name in ("a/60_01.amc", "x.bvh", "SMPLX_NEUTRAL.npz", "b/SMPL_MALE.pkl"))
+    for name in ("a/60_01.amc", "x.bvh", "SMPLX_NEUTRAL.npz", "b/SMPL_MALE.pkl", "out/films/a.npz"):
+        assert refused.search(name), name
     assert not [name for name in tracked(".") if refused.search(name)]
+
+
+def test_no_array_of_the_repository_is_recorded_motion() -> None:
+    """Neither a row of a recording beside samples of it, nor a scene of which a model was given frames."""
+    found = []
+    for name in sorted(name for name in tracked(".") if name.endswith(".npz")):
+        with np.load(ROOT / name) as arrays:
+            words = [str(word) for key in arrays.files if arrays[key].dtype.kind == "U" for word in arrays[key].flat]
+            if any(TRUTH in word for word in words) or ("given" in arrays.files and arrays["given"].any()):
+                found.append(name)
+    assert not found
+    assert "docs/evidence/films/" in (ROOT / ".gitignore").read_text()
 
 
 def tracked(folder: str) -> set[str]:
