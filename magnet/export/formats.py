@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +17,11 @@ from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
-from magnet.export.npz import each_of, read_smplx, require_rate, save_smplx, stance_in
+from magnet.export.npz import each_of, save_smplx
+from magnet.export.npz_files import read_people
 from magnet.export.retarget import load_bvh, together
-from magnet.export.smpl_keys import posed
-from magnet.export.upright import agreed, said
 from magnet.export.usd import require_usd, save_usd
-from magnet.files import load_npz, regular
+from magnet.files import regular
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, require_rotations
 
@@ -106,9 +104,7 @@ def read(
             way = "lowered" if imported.floor > 0 else "raised"
             notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
-    people = [_read_npz(file, body, options) for file in files]
-    if len(people) > 1 and options.up is None:
-        people = _of_one_axis(files, people, body, options)
+    people = read_people(files, body, options.up, options.unit, options.in_fps)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = [note for one in people for note in one.notes]
     if len(scenes) == 1:
@@ -145,64 +141,6 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
         return []
     where = f"{abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where models have their floor"
     return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
-
-
-@dataclass(frozen=True)
-class _Npz:
-    """A scene of ours or SMPL-X's keys, told apart by what they hold."""
-
-    scene: Scene
-    notes: list[str]
-    foreign: bool  # another program wrote it
-    up: str  # axis of the file
-
-
-def _of_one_axis(files: Sequence[Path], people: Sequence[_Npz], body: Body, options: Reading) -> list[_Npz]:
-    """Files of one scene read with the axis that suits them together: somebody may lie in one of them."""
-    if len({one.up for one in people}) == 1 or any(one.scene.scenes != 1 for one in people):
-        return list(people)
-    stances = [stance_in(one.scene, body, one.up, not one.foreign) for one in people]
-    ups = agreed(stances)
-    read = []
-    for k, (file, one) in enumerate(zip(files, people, strict=True)):
-        again = one if ups[k] == one.up else _read_npz(file, body, replace(options, up=ups[k]))
-        read.append(replace(again, notes=[*again.notes, *(f"{file.name}: {note}" for note in said(stances, ups, k))]))
-    return read
-
-
-def _read_npz(path: Path, body: Body, options: Reading) -> _Npz:
-    """A scene of ours or SMPL-X's keys, and how it was read."""
-    up, unit = options.up, options.unit
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
-    try:
-        with load_npz(path) as file:
-            keys = set(file.files)
-    except Exception as error:  # a damaged archive may raise anything
-        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    if "meta" in keys and not posed(keys):
-        if up not in (None, "y"):
-            raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
-        if unit not in (None, "m"):
-            raise ValueError(
-                f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
-            )
-        scene = Scene.load(path)
-        require_rate(path, scene.fps, options.in_fps)
-        if scene.body != body.id:
-            raise ValueError(
-                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
-            )
-        return _Npz(scene, [], False, "y")
-    scene, found = read_smplx(path, body, up, unit, options.in_fps)
-    note, ours = [], {"body", "surface_model_type"} <= keys
-    if up is None and found not in ("y", "z"):
-        note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
-    if not ours and body.id.startswith("open"):
-        note.append(
-            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
-        )
-    return _Npz(scene, note, not ours, found)
 
 
 @dataclass(frozen=True)

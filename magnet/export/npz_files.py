@@ -1,0 +1,92 @@
+"""Scenes from npz files, of magnet or of other programs, a file a person or one for all."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from magnet.body import Body
+from magnet.export.npz import read_smplx, require_rate, stance_in
+from magnet.export.smpl_keys import posed
+from magnet.export.upright import agreed, said
+from magnet.files import load_npz
+from magnet.motion.scene import Scene
+
+
+@dataclass(frozen=True)
+class NpzFile:
+    """A scene of ours or SMPL-X's keys, told apart by what they hold."""
+
+    scene: Scene
+    notes: list[str]
+    foreign: bool  # another program wrote it
+    up: str  # axis of the file
+
+
+def read_people(
+    files: Sequence[Path], body: Body, up: str | None, unit: str | None, in_fps: float | None
+) -> list[NpzFile]:
+    """Read the npz files of one scene, other programs' with the axis that suits them together.
+
+    Args:
+        files: one for each person, or one for all.
+        body, up, unit, in_fps: as in `magnet.export.npz.read_smplx`.
+
+    Raises:
+        ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts.
+    """
+    people = [_read(file, body, up, unit, in_fps) for file in files]
+    if up is None and len(people) > 1:
+        people = _of_one_axis(files, people, body, unit, in_fps)
+    return people
+
+
+def _of_one_axis(
+    files: Sequence[Path], people: Sequence[NpzFile], body: Body, unit: str | None, in_fps: float | None
+) -> list[NpzFile]:
+    """Somebody may lie in one of the files: then it is read again with the axis of the others."""
+    if len({one.up for one in people}) == 1 or any(one.scene.scenes != 1 for one in people):
+        return list(people)
+    stances = [stance_in(one.scene, body, one.up, not one.foreign) for one in people]
+    ups = agreed(stances)
+    read = []
+    for k, (file, one) in enumerate(zip(files, people, strict=True)):
+        again = one if ups[k] == one.up else _read(file, body, ups[k], unit, in_fps)
+        read.append(replace(again, notes=[*again.notes, *(f"{file.name}: {note}" for note in said(stances, ups, k))]))
+    return read
+
+
+def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None) -> NpzFile:
+    """A scene of ours or SMPL-X's keys, and how it was read."""
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
+    try:
+        with load_npz(path) as file:
+            keys = set(file.files)
+    except Exception as error:  # a damaged archive may raise anything
+        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
+    if "meta" in keys and not posed(keys):
+        if up not in (None, "y"):
+            raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
+        if unit not in (None, "m"):
+            raise ValueError(
+                f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
+            )
+        scene = Scene.load(path)
+        require_rate(path, scene.fps, in_fps)
+        if scene.body != body.id:
+            raise ValueError(
+                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
+            )
+        return NpzFile(scene, [], False, "y")
+    scene, found = read_smplx(path, body, up, unit, in_fps)
+    note, ours = [], {"body", "surface_model_type"} <= keys
+    if up is None and found not in ("y", "z"):
+        note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
+    if not ours and body.id.startswith("open"):
+        note.append(
+            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
+        )
+    return NpzFile(scene, note, not ours, found)
