@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magnet.body import Body
-from magnet.export.npz import read_smplx, require_rate, stance_in
+from magnet.export.npz import is_open, read_smplx, require_rate, stance_in
 from magnet.export.smpl_keys import posed
 from magnet.export.upright import agreed, said
 from magnet.files import load_npz
@@ -85,7 +85,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
     note, ours = [], {"body", "surface_model_type"} <= keys
     if up is None and found not in ("y", "z"):
         note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
-    if not ours and body.id.startswith("open"):
+    if not ours and is_open(body):
         note.append(
             f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
         )
