@@ -111,7 +111,7 @@ def table(results: dict[str, Rows]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ckpt_path", default="duet")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the runs and the table")
+    parser.add_argument("--out", type=Path, default=Path("runs/relation"), help="folder of the runs and the table")
     parser.add_argument("--samples", type=int, default=10)
     parser.add_argument("--limit", type=int, default=24, help="test scenes of recordings at most")
     parser.add_argument("--only", nargs="+", choices=list(RUNS), default=list(RUNS))

@@ -57,8 +57,8 @@ BUDGETS = {
     "small": Budget(8, 5, 3, None, 300, 3),
     "paper": Budget(1_000_000, 10, 3, None, 1800, 5),
 }
-"""`tiny` is for tests, `evening` for a core and two hours, `small` for two cores and a day, `paper` for a GPU and the
-paper's own data."""
+"""`tiny` is for tests, `evening` for half a core and four hours, `small` for two cores and a day, `paper` for a GPU
+and the paper's own data."""
 
 
 @dataclass(frozen=True)
