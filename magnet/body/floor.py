@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -21,6 +22,8 @@ OFF = 0.25
 to 0.15 m, also where somebody dips a foot into it."""
 JUMP, JUMPED = 16, 0.9
 """In fewer frames somebody may be in the air all the time, up to so many metres; in CMU up to 0.78."""
+NEAR = 0.05
+"""Metres off the floor of the others at which somebody is told of."""
 MOMENTS = 32
 """Evenly spaced frames that are examined."""
 
@@ -88,6 +91,23 @@ def on_floor(scene: Scene, body: Body | None = None) -> Scene:
     T_new_world = torch.eye(4, dtype=scene.T_world_root.dtype, device=scene.device).repeat(scene.scenes, 1, 1, 1, 1)
     T_new_world[:, 0, 0, 1, 3] = -torch.where(heights.isfinite(), heights, 0.0).to(T_new_world)
     return scene.transformed(T_new_world)
+
+
+def off_their_floor(heights: Sequence[float], names: Sequence[str] = ()) -> list[str]:
+    """A sentence for each person who does not stand where the scene's floor is.
+
+    Legs have another length where a recording's shapes are left out, and one height is all that a scene is moved by.
+
+    Args:
+        heights: (P,) metres over the floor at which each person stands, NaN for nobody.
+        names: theirs; empty: numbers.
+    """
+    said = "the scene's floor: so recorded, or legs are longer or shorter than recorded; magnet refine puts feet on it"
+    return [
+        f"{names[p] if names else f'person {p}'}: stands {100 * abs(m):.0f} cm {'over' if m > 0 else 'under'} {said}"
+        for p, m in enumerate(heights)
+        if abs(m) > NEAR
+    ]
 
 
 def level(scene: Scene, body: Body | None = None) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.body import Body, load_body, on_floor
-from magnet.body.floor import level
+from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, paths_of, save_bvh
@@ -131,6 +131,8 @@ def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[
             way = "lowered" if metres > 0 else "raised"
             far = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
             notes = [*notes, f"everybody was {way} by {far} onto the floor; --keep_floor leaves them"]
+        heights = standing(lowest(moved, body), counting(moved)).flatten().tolist() if moved.frames else []
+        notes = [*notes, *(off_their_floor(heights) if moved.scenes == 1 else [])]
         return Read(moved, body, tuple(notes))
     return Read(scene, body, (*notes, *_floor_note(scene, body)))
 

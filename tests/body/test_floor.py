@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import base, floor, load_body
-from magnet.body.floor import JUMP, OFF, level, lowest, off_floor, on_floor, standing
+from magnet.body.floor import JUMP, OFF, level, lowest, off_floor, off_their_floor, on_floor, standing
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.synthetic import Synthetic
 from magnet.export.bvh_read import read_bvh
@@ -169,3 +170,10 @@ def test_a_body_first_read_while_testing_can_be_fitted_afterwards():
     with torch.inference_mode():
         lowest(still([0, 0, 0], 0.93))
     assert not load_body().J_template.is_inference() and not floor.open_body().J_shapedirs.is_inference()
+
+
+def test_whoever_stands_off_the_floor_of_the_others_is_named_with_centimetres() -> None:
+    near, over, under = off_their_floor([0.04, 0.09, -0.2]), off_their_floor([0.0, 0.09], ("A", "B")), [-0.2, math.nan]
+    assert [text.split(":")[0] for text in near] == ["person 1", "person 2"]
+    assert over[0].startswith("B: stands 9 cm over the scene's floor") and len(over) == 1
+    assert "20 cm under" in off_their_floor(under)[0] and len(off_their_floor(under)) == 1

@@ -15,6 +15,7 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.family import title
 from magnet.body.fit import BodyFit, fit_body, floor_height
+from magnet.body.floor import off_their_floor
 from magnet.datamodules.clip import Clip, Split
 from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
@@ -135,7 +136,13 @@ def canonicalize(
             motion.joints[:, :, check_motion.WALKING].numpy(), motion.valid, recording.said_fps or recording.fps, FPS
         )
     soles = floor_height(motion.joints, body, motion.betas.float()).numpy()
-    motion = motion.lowered(float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE)))
+    floor = float(np.percentile(soles[motion.valid], FLOOR_PERCENTILE))
+    heights = [
+        float(np.percentile(own[there], FLOOR_PERCENTILE)) if there.any() else np.nan
+        for own, there in zip(soles.T, motion.valid.T, strict=True)
+    ]
+    notes += off_their_floor([height - floor for height in heights], names)
+    motion = motion.lowered(floor)
     cuts = sorted({*jumps.tolist(), *(flag.start for flag in flags if flag.cut)})
     return Canonicalized(_cut(motion, cuts, flagged, body, name, source, split, options.min_frames), tuple(notes))
 
