@@ -41,8 +41,7 @@ def axis_angle(R):
 
 def main(model="duet.onnx", out="dance.npz", people=2):
     network, decoder = (onnxruntime.InferenceSession(model.replace(".onnx", end)) for end in (".onnx", "_decoder.onnx"))
-    tokens = sample(network, people)
-    betas, poses, places = np.zeros((1, tokens.shape[2], 10), np.float32), [], []
+    tokens, betas, poses, places = sample(network, people), np.zeros((1, 4, 10), np.float32), [], []
     pose, deltas, pairs = (each[0] for each in decoder.run(None, {"tokens": tokens, "betas": betas}))
     for p in range(people):  # the first one starts at the origin, the others where that one sees them
         (heading, place), (turn, step) = planar(pairs[0, 0, p - 1]) if p else (1, 0), planar(deltas[1:, p])
@@ -53,7 +52,8 @@ def main(model="duet.onnx", out="dance.npz", people=2):
         local[:, 0] = about @ local[:, 0]
         poses.append(np.pad(axis_angle(local).reshape(-1, 66), ((0, 0), (0, 99))))  # fingers, jaw and eyes at rest
         places.append((about @ pose[:, p, 132:, None])[..., 0] + np.stack([place.imag, 0 * place.imag, place.real], -1))
-    np.savez(out, poses=poses, trans=places, betas=betas[0, :people], mocap_frame_rate=30.0)
+    trans = np.subtract(places, (0.003, -0.351, 0.012))  # without the rest pelvis of SMPL-X's mean shape
+    np.savez(out, poses=poses, trans=trans, betas=betas[0, :people], mocap_frame_rate=30.0)
 
 
 if __name__ == "__main__":

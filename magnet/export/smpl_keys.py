@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.motion.rotations import to_rotvec
+from magnet.motion.scene import BODY_JOINTS
 
 Doubles = NDArray[np.float64]
 
@@ -53,12 +54,12 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     if whole is not None:
         return _axis_angle(where, held[whole])
     parts = []
-    for keys, joints in ((ORIENT, 1), (BODY, None)):
+    for keys, least, joints in ((ORIENT, 3, 1), (BODY, 3 * BODY_JOINTS - 3, None)):
         key = first_of(keys, there)
         if key is None:
             has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
             raise ValueError(f"{where}: lacks {' or '.join(keys[:2])}; it has {has}")
-        parts.append(_axis_angle(where, held[key], joints))
+        parts.append(_axis_angle(where, held[key], least, joints))
     root, body = parts
     if root.shape[-2] != body.shape[-2]:
         raise ValueError(
@@ -69,9 +70,10 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     return np.concatenate(parts, axis=-1)
 
 
-def _axis_angle(where: object, value: Any, joints: int | None = None) -> Doubles:
+def _axis_angle(where: object, value: Any, least: int = 0, joints: int | None = None) -> Doubles:
     """Rotations as axis-angle numbers: (..., J, 3, 3) matrices, (..., J, 3) vectors or flat already -> (..., 3 J)
 
+    least: numbers a frame; 0: the caller looks.
     joints: J, where (people, frames, 3) would look like it.
     """
     array = np.asarray(value)
@@ -86,9 +88,9 @@ def _axis_angle(where: object, value: Any, joints: int | None = None) -> Doubles
         array = to_rotvec(torch.from_numpy(array)).numpy()
     if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):
         array = array.reshape(*array.shape[:-2], -1)
-    if array.ndim not in (2, 3):
+    if array.ndim not in (2, 3) or array.shape[-1] < least:
         raise ValueError(
-            f"{where}: rotations: got shape {np.shape(value)}, expected (frames, 66 or more) in axis-angle, or people "
-            "first"
+            f"{where}: rotations: got shape {np.shape(value)}, expected (frames, {least or 3 * BODY_JOINTS} or more) "
+            "in axis-angle, or people first"
         )
     return array
