@@ -41,7 +41,7 @@ def axis_angle(R):
 
 def main(model="duet.onnx", out="dance.npz", people=2):
     network, decoder = (onnxruntime.InferenceSession(model.replace(".onnx", end)) for end in (".onnx", "_decoder.onnx"))
-    tokens, betas, poses, places = sample(network, people), np.zeros((1, 4, 10), np.float32), [], []
+    betas, poses, places = np.zeros((1, (tokens := sample(network, people)).shape[2], 10), np.float32), [], []
     pose, deltas, pairs = (each[0] for each in decoder.run(None, {"tokens": tokens, "betas": betas}))
     for p in range(people):  # the first one starts at the origin, the others where that one sees them
         (heading, place), (turn, step) = planar(pairs[0, 0, p - 1]) if p else (1, 0), planar(deltas[1:, p])

@@ -267,7 +267,7 @@ def seeds(options: dict[str, Any]) -> dict[str, Any]:
     for part in ("model", "data"):
         found[f"{part}.seed"] = ((options.get(part) or {}).get("init_args") or {}).get("seed")
     known = {name: seed for name, seed in found.items() if seed is not None}
-    return {"seed": known.get("seed", options.get("seed_everything")), "seeds": known}
+    return {"seed": known.get("seed", known.get("seed_everything")), "seeds": known}
 
 
 class Record(Callback):
