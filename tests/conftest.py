@@ -39,7 +39,7 @@ def scene(generator: torch.Generator) -> Scene:
 def cmu_root() -> Path:
     """The folder of real recordings: MAGNET_CMU, or shared/data/cmu beside the repository."""
     beside = Path(__file__).parents[2] / "shared" / "data" / "cmu"
-    root = Path(os.environ.get("MAGNET_CMU", beside))
+    root = Path(os.environ.get("MAGNET_CMU") or beside)  # set to nothing is not set
     if not root.is_dir():
         pytest.skip(f"no CMU recordings at {root}; set MAGNET_CMU")
     return root
