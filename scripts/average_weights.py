@@ -3,7 +3,7 @@
     python scripts/average_weights.py OUT.ckpt A.ckpt B.ckpt ...
 
 Trainings that go on from one model with little data each end somewhere else in the same valley; their mean is often
-better than each (Wortsman et al. 2022, Model soups). What the checkpoints hold beside weights is the first one's.
+better than each (Wortsman et al. 2022, Model soups). One named twice counts twice. What the checkpoints hold beside weights is the first one's.
 """
 
 from __future__ import annotations
@@ -61,13 +61,14 @@ def main(arguments: list[str] | None = None) -> None:
     if given.out.exists() and not given.overwrite:
         parser.error(f"{given.out} exists already (OUT comes first); --overwrite writes over it")
     try:
-        read: list[dict[str, Any]] = [checkpoints.read(path) for path in given.checkpoints]
-        made = {name: read[0][name] for name in KEPT if name in read[0]}
-        made["state_dict"] = mean_of([one["state_dict"] for one in read])
+        each: dict[Path, dict[str, Any]] = {path: checkpoints.read(path) for path in dict.fromkeys(given.checkpoints)}
+        first = each[given.checkpoints[0]]
+        made = {name: first[name] for name in KEPT if name in first}
+        made["state_dict"] = mean_of([each[path]["state_dict"] for path in given.checkpoints])
     except (OSError, ValueError, KeyError) as error:
         parser.error(str(error).splitlines()[0])
     checkpoints.save(made, given.out)
-    print(f"{given.out}: the mean of {len(read)} checkpoints")
+    print(f"{given.out}: the mean of {len(given.checkpoints)} checkpoints")
 
 
 if __name__ == "__main__":

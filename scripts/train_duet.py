@@ -31,6 +31,7 @@ Shares = dict[str, int]
 AGAIN: Shares = {"denoiser": 1, "on": 1, "again": 2}
 SIDES: Shares = {"left": 1, "right": 1}
 ENDS: Shares = SIDES | {"left_end": 1, "right_end": 1}
+SIX: Shares = ENDS | {"answers": 2, "long": 2}
 
 BEGINS: dict[str, Shares] = {
     "tokenizer": {},
@@ -48,10 +49,19 @@ BEGINS: dict[str, Shares] = {
     "right_end": SIDES,
     "answers": ENDS,
     "long": ENDS,
+    "filled": SIX,
+    "turns": SIX,
+    "groups": {"filled": 1, "turns": 1},
+    "filled_solos": SIX,
+    "turns_solos": SIX,
+    "groups_solos": {"filled_solos": 1, "turns_solos": 1},
     "decoder": {"tokenizer": 1},
 }
 """The stages in the order they are run, each with those from whose mean it begins."""
-RELEASED = ENDS | {"answers": 2, "long": 2}
+RELEASED: Shares = SIX | {
+    **dict.fromkeys(("filled", "turns", "filled_solos", "turns_solos"), 2),
+    **dict.fromkeys(("groups", "groups_solos"), 1),
+}
 """Of whose mean the released denoiser is."""
 STAGES = tuple(BEGINS)
 

@@ -31,7 +31,7 @@ def save(folder: Path, step: int) -> None:
 
 def test_stages_take_the_steps_of_their_configurations_unless_told_otherwise() -> None:
     plain = recipe.wished_steps([])
-    short = {"answers": 384, "long": 356}
+    short = {"answers": 384, "long": 356, "groups": 922, "groups_solos": 789}
     assert set(plain) == set(recipe.STAGES) and plain == plain | short
     assert min(steps for stage, steps in plain.items() if stage not in short) >= 1000
     assert recipe.wished_steps(["denoiser=7"]) == {**plain, "denoiser": 7}
