@@ -3,7 +3,8 @@
     python scripts/average_weights.py OUT.ckpt A.ckpt B.ckpt ...
 
 Trainings that go on from one model with little data each end somewhere else in the same valley; their mean is often
-better than each (Wortsman et al. 2022, Model soups). One named twice counts twice. What the checkpoints hold beside weights is the first one's.
+better than each (Wortsman et al. 2022, Model soups). One named twice counts twice. What the checkpoints hold beside
+weights is the first one's.
 """
 
 from __future__ import annotations
