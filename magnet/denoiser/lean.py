@@ -378,11 +378,14 @@ def seen(steps: int, people: int, block: int, device: torch.device) -> Tensor | 
         return block_causal(torch.arange(steps, device=device).repeat_interleave(people), block)
 
 
-FULL: Kept[LeanTransformer] = Kept(LeanTransformer)  # type: ignore[arg-type]
-HALF: Kept[LeanTransformer] = Kept(lambda network: LeanTransformer(network, "bf16"))  # type: ignore[arg-type]
-WHOLE: Kept[LeanTransformer] = Kept(lambda network: LeanTransformer(network, "int8"))  # type: ignore[arg-type]
+LEAN: dict[Precision, Kept[LeanTransformer]] = {
+    "float32": Kept(LeanTransformer),  # type: ignore[arg-type]
+    "bf16": Kept(lambda network: LeanTransformer(network, "bf16")),  # type: ignore[arg-type]
+    "int8": Kept(lambda network: LeanTransformer(network, "int8")),  # type: ignore[arg-type]
+}
+"""Lean forms of networks by how they round."""
 
 
 def lean(network: Transformer, precision: Precision = "float32") -> LeanTransformer:
     """The lean form of a network of float32 weights, made once and again after they have changed."""
-    return {"float32": FULL, "bf16": HALF, "int8": WHOLE}[precision].of(network)
+    return LEAN[precision].of(network)

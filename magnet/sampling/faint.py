@@ -28,7 +28,7 @@ def faint_levels(
     if guidance.stabilization_level:
         sure = shown_clean(known, guidance.stabilization_after, since)
         levels = torch.where(sure, 0, guidance.stabilization_level)
-    if guidance.stabilization_unseen and stage.apart:
+    if guidance.stabilization_unseen and stage.unseen:
         lately = torch.where(shown_clean(known, AFTER_UNSEEN, since), 0, guidance.stabilization_unseen)
         levels = lately if levels is None else torch.maximum(levels, lately)
     if guidance.stabilization_beside and not live:

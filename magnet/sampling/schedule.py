@@ -35,14 +35,14 @@ class Stage:
         ahead: token steps of pure noise that the model is shown after the window, beyond the scene's end if need be.
             The model was trained on full windows and slows people down where a shorter window ends. What it predicts
             for these steps is decoded with the last block of a causal plan.
-        apart: whether agents act without seeing what others do in this block, even where nobody else is there.
+        unseen: whether agents act without seeing what others do in this block, even where nobody else is there.
     """
 
     start: int
     levels: Tensor
     visibility: Tensor | None = None
     ahead: int = 0
-    apart: bool = False
+    unseen: bool = False
 
     @property
     def stop(self) -> int:
@@ -56,7 +56,7 @@ class Stage:
 
     def same_but_start(self, other: Stage) -> bool:
         """Whether another stage does the same, wherever its window begins."""
-        if (self.ahead, self.apart) != (other.ahead, other.apart) or not torch.equal(self.levels, other.levels):
+        if (self.ahead, self.unseen) != (other.ahead, other.unseen) or not torch.equal(self.levels, other.levels):
             return False
         if self.visibility is None or other.visibility is None:
             return self.visibility is other.visibility
@@ -325,6 +325,6 @@ class MaskSchedule:
                 hidden |= active & (levels[-1] == LEVELS)
                 ahead = start + grid.window - stop
                 sees = ~hidden if hidden.any() else None
-                stages.append(Stage(start, levels.short(), sees, ahead, apart=unseen is not None))
+                stages.append(Stage(start, levels.short(), sees, ahead, unseen=unseen is not None))
                 level[start:stop] = levels[-1]
         return MaskSchedule(grid.tokens, grid.agents, tuple(stages), known, lookahead, causal)
