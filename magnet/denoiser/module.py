@@ -95,7 +95,7 @@ class Denoiser(DenoiserCore, TokenModel):
     def training_step(self, batch: Scene, batch_idx: int) -> Tensor:
         place = (self.hparams["seed"], "train", self.global_step, batch_idx, self.global_rank)
         generator = step_generator(self.device, *place)
-        scene = displaced_at_first(batch, self.self_forcing.displaced, generator)
+        scene = displaced_at_first(batch, self.self_forcing.displaced, generator, self.self_forcing.far)
         scene, made = with_made_pasts(scene, self.made_pasts, generator)
         if self.graphed is None:
             losses = self.losses(scene, generator, made)

@@ -176,15 +176,17 @@ class SelfForcing:
         pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
         displaced: share of the training scenes in which people stand a little off at first and come back, as those must
             who have drifted while they were generated; see `displaced_at_first`.
+        far: share of these in which they stand metres off, as couples who have left each other do.
     """
 
     share: float = 0.0
     placement: Placement = "fuse"
     pairwise_weight: float = 0.02
     displaced: float = 0.0
+    far: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("share", "displaced"):
+        for name in ("share", "displaced", "far"):
             require_number(name, getattr(self, name), 0, 1)
         require_choice("placement", self.placement, Placement)
         require_number("pairwise_weight", self.pairwise_weight, least=0)

@@ -27,6 +27,9 @@ MOST_NOISE, LEAST_NOISE = 0.75, 0.1
 DISPLACED_GROUND, DISPLACED_YAW = 0.1, 0.12
 """Standard deviations, in metres and radians, by which somebody stands off at first."""
 
+FAR_GROUND, FAR_YAW, FAR_FRAMES = 1.2, 0.62, 30
+"""The same of those who stand far off, as couples who leave each other do, and how many frames longer they take."""
+
 RETURN_FRAMES = 30, 75
 """Fewest and most frames in which such people come back: slowly, for feet slide on the way."""
 
@@ -59,7 +62,7 @@ def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Gener
 
 
 @torch.no_grad()
-def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -> Scene:
+def displaced_at_first(scene: Scene, share: float, generator: torch.Generator, far: float = 0.0) -> Scene:
     """Some scenes with everybody moved and turned a little up to a random frame, and eased back from there.
 
     What a model has made drifts: people stand where no recording has them, and the way back is in none. Poses stay as
@@ -69,6 +72,7 @@ def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -
         scene: (B, T) of P agents.
         share: of the scenes that are changed.
         generator: of all randomness.
+        far: share of those in which people stand far off.
     """
     if not share:
         return scene
@@ -76,11 +80,15 @@ def displaced_at_first(scene: Scene, share: float, generator: torch.Generator) -
     device, dtype = scene.T_world_root.device, scene.T_world_root.dtype
     changed, begin, length = torch.rand(3, B, 1, generator=generator, device=device)
     begin = begin * T
-    length = RETURN_FRAMES[0] + (RETURN_FRAMES[1] - RETURN_FRAMES[0]) * length
+    wide = torch.zeros_like(begin, dtype=torch.bool)
+    if far:
+        wide = torch.rand(B, 1, generator=generator, device=device) < far
+    length = RETURN_FRAMES[0] + (RETURN_FRAMES[1] - RETURN_FRAMES[0]) * length + FAR_FRAMES * wide
     way = ((torch.arange(T, device=device) - begin) / length).clamp(0, 1)
     off = (1 - smoothstep(way)) * (changed < share)  # (B, T)
     drawn = torch.randn(B, 1, P, 3, generator=generator, device=device) * off[..., None, None]
-    yaw, ground = DISPLACED_YAW * drawn[..., 0], DISPLACED_GROUND * drawn[..., 1:]
+    yaw = torch.where(wide[..., None], FAR_YAW, DISPLACED_YAW) * drawn[..., 0]
+    ground = torch.where(wide[..., None, None], FAR_GROUND, DISPLACED_GROUND) * drawn[..., 1:]
     T_turn = from_planar(yaw, torch.zeros_like(ground)).to(dtype)
     T_world_root = scene.T_world_root.clone()
     T_world_root[..., :3, :3] = T_turn[..., :3, :3] @ T_world_root[..., :3, :3]

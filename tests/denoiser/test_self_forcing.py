@@ -100,6 +100,22 @@ def test_displaced_people_come_back_and_their_poses_stay(scene):
     assert float(far.diff(dim=1).abs().max()) < 0.02, "nobody jumps"
 
 
+def test_some_displaced_people_stand_metres_off_and_come_back_as_slowly_as_they_walk():
+    long = random_scene(64, 160, 2, torch.Generator().manual_seed(0))
+
+    def off(far: float) -> torch.Tensor:
+        moved = displaced_at_first(long, 1.0, torch.Generator().manual_seed(1), far)
+        assert torch.equal(moved.body_rot, long.body_rot)
+        return (moved.T_world_root - long.T_world_root)[..., :3:2, 3].norm(dim=-1)  # (B, T, P)
+
+    near, some, every = off(0.0), off(0.3), off(1.0)
+    assert torch.equal(near, off(0.0)) and float(near.max()) < 0.6
+    assert 0.15 < float((some[:, 0].amax(dim=1) > 0.6).double().mean()) < 0.45
+    assert 1.0 < float(every[:, 0].mean()) < 2.2
+    assert bool((every.diff(dim=1) < 1e-5).all()), "nobody goes further away"
+    assert float(every.diff(dim=1).abs().quantile(0.99)) * 30 < 3.0  # metres a second
+
+
 def test_displaced_people_turn_about_themselves(scene):
     moved = displaced_at_first(scene, 1.0, torch.Generator().manual_seed(1))
     turned = inverse(scene.T_world_root) @ moved.T_world_root
