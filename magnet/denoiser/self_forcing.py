@@ -63,7 +63,7 @@ def with_made_pasts(scene: Scene, made: MadePasts | None, generator: torch.Gener
 
 @torch.no_grad()
 def displaced_at_first(scene: Scene, share: float, generator: torch.Generator, far: float = 0.0) -> Scene:
-    """Some scenes with everybody moved and turned, a little or by metres, up to a random frame, and eased back from there.
+    """Some scenes with everybody moved and turned, a little or far, up to a random frame, and eased back from there.
 
     What a model has made drifts: people stand where no recording has them, and the way back is in none. Poses stay as
     they are, so that where people are does not follow from them.
