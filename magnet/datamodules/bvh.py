@@ -9,11 +9,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
-from magnet.datamodules.reading.arrays import AGAIN
+from magnet.datamodules.reading.arrays import AGAIN, gap_note
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
@@ -21,7 +22,7 @@ from magnet.datamodules.registry import register_reader
 from magnet.export.bvh_read import Bvh, read_bvh
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood_together
-from magnet.motion.resample import resample_points, resample_rotations
+from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene
 
@@ -51,9 +52,15 @@ class BvhTrack:
     def frames(self) -> int:
         return self.file.frames
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Frames that the file has. (T,)"""
+        return np.ones(self.frames, dtype=bool) if self.file.tracked is None else self.file.tracked
+
     def slice(self, start: int, stop: int) -> BvhTrack:
         part = slice(start, stop)
-        return replace(self, file=replace(self.file, place=self.file.place[part], local=self.file.local[part]))
+        place, local, valid = self.file.place[part], self.file.local[part], self.valid[part]
+        return replace(self, file=replace(self.file, place=place, local=local, tracked=valid))
 
     def resampled(self, fps: float) -> BvhTrack:
         """Rotations relative to the parent by slerp, positions by straight lines."""
@@ -62,7 +69,8 @@ class BvhTrack:
         quat = to_quat(torch.from_numpy(self.file.local))
         local = from_quat(resample_rotations(quat, self.fps, fps)).numpy()
         place = resample_points(torch.from_numpy(self.file.place), self.fps, fps).numpy()
-        return replace(self, file=replace(self.file, place=place, local=local, fps=fps))
+        valid = resample_valid(self.valid[:, None], self.fps, fps)[:, 0]
+        return replace(self, file=replace(self.file, place=place, local=local, fps=fps, tracked=valid))
 
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
         """The person on `body`; fitted, unless the skeleton is the body's own."""
@@ -134,10 +142,11 @@ class BVHReader(OwnReader[BvhTrack]):
     def open(self, person_file: PersonFile, alone: bool) -> tuple[list[BvhTrack], list[str]]:
         """The person of a file."""
         try:
-            file = read_bvh(person_file.file)
+            file = read_bvh(person_file.file, gaps=True)
         except (ValueError, OSError) as error:
             raise DataError(f"{error}; {AGAIN}") from error
-        return [BvhTrack(file, self.unit, self.joints, self.worst_fit, file.fps)], []
+        track = BvhTrack(file, self.unit, self.joints, self.worst_fit, file.fps)
+        return [track], list(gap_note(file.path, track.valid))
 
     def recording(
         self, where: str, tracks: Sequence[BvhTrack], names: Sequence[str], notes: Sequence[str]
@@ -160,6 +169,7 @@ class BVHReader(OwnReader[BvhTrack]):
             up="+y" if differ else _axis(skeletons[0].up),
             positions=np.stack(places, axis=1),
             joints=tuple(joints),
+            valid=np.stack([track.valid for track in tracks], axis=1),
             persons=tuple(name or track.file.path.stem for name, track in zip(names, tracks, strict=True)),
             notes=(*notes, *said),
             skeletons=tuple(replace(track, unit=one.unit) for track, one in zip(tracks, skeletons, strict=True)),

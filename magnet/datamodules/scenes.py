@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
+from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported, without_gaps
 from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
@@ -131,7 +131,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         else:
             keys = _keys(path)
             if "meta" in keys and not _posed(dict.fromkeys(keys)):
-                return _ours(path), []
+                return _ours(path)
             held = open_npz(path, (), tuple(keys))
             if len(held) < len(keys) and not any(_posed(one) for one in (held, *held.values())):
                 pickled = ", ".join(key for key in keys if key not in held)
@@ -163,7 +163,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         one_length(
             where, {"rotations": poses.shape[-2], "translations": np.shape(place)[-2] if np.ndim(place) > 1 else 0}
         )
-        places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3))
+        places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3), finite=False)
         if SCALE in held:
             places = places / floats(f"{where}: {SCALE}", np.ravel(held[SCALE])[:1], (1,))
         own = bool(_body_of(held)) and OWN_SHAPE in held  # transl is SMPL-X's, the shapes are the open body's
@@ -178,17 +178,19 @@ class ScenesReader(OwnReader[PosedTrack]):
             raise DataError(f"{where}: shape numbers of {len(betas)} people for {len(poses)}; {AGAIN}")
         for p in range(len(poses)):
             shape, said = (np.zeros(10), ()) if betas is None else shape_numbers(where, {"betas": np.asarray(betas[p])})
-            notes.extend(said)
+            whose = f"{where}, person {p + 1}" if several else where
+            (turns, at), tracked, gaps = without_gaps(whose, poses[p, :, :WIDTH], places[p])
+            notes.extend((*said, *gaps))
             yield PosedTrack(
                 fps=fps,
-                poses=poses[p, :, :WIDTH].reshape(-1, 22, 3),
-                place=places[p],
+                poses=turns.reshape(-1, 22, 3),
+                place=at,
                 betas=shape,
                 shapes_of="" if betas is None else FAMILIES.get(width, ""),
                 name=str(held.get(PERSON, "")),
                 body=_body_of(held),
                 at_pelvis=own,
-                valid=np.ones(poses.shape[1], dtype=bool),
+                valid=tracked,
                 gender=gender_of(_one_of(held.get("gender"), p)),
             )
 
@@ -248,8 +250,8 @@ def _is_body(path: Path) -> bool:
         return False  # damaged: said when it is read
 
 
-def _ours(path: Path) -> list[PosedTrack]:
-    """People of a scene that magnet wrote."""
+def _ours(path: Path) -> tuple[list[PosedTrack], list[str]]:
+    """People of a scene that magnet wrote, and what should be known of them."""
     with reported(path, "a scene of magnet's"):
         scene = Scene.load(path)
     if scene.scenes != 1:
@@ -258,25 +260,29 @@ def _ours(path: Path) -> list[PosedTrack]:
             f"one.npz --scene 0"
         )
     valid = np.ones(scene.frames, dtype=bool) if scene.valid is None else scene.valid[0].numpy()
-    if not all(tensor.isfinite().all() for tensor in (scene.body_rot, scene.T_world_root, scene.betas)):
-        raise DataError(f"{path}: holds NaN or infinity; {AGAIN}")
-    tracks = []
+    tracks: list[PosedTrack] = []
+    notes: list[str] = []
     for p in scene.present[0].nonzero()[:, 0].tolist():
+        if not scene.betas[0, p].isfinite().all():
+            raise DataError(f"{path}: shape numbers hold NaN or infinity; {AGAIN}")
         rotations = torch.cat([scene.T_world_root[0, :, p, None, :3, :3], scene.body_rot[0, :, p]], dim=1).double()
+        place = scene.T_world_root[0, :, p, :3, 3].double()
+        (turns, at), tracked, gaps = without_gaps(f"{path}, person {p + 1}", rotations.numpy(), place.numpy())
+        notes += gaps
         tracks.append(
             PosedTrack(
                 fps=scene.fps,
-                poses=to_rotvec(rotations).numpy(),
-                place=scene.T_world_root[0, :, p, :3, 3].double().numpy(),
+                poses=to_rotvec(torch.from_numpy(turns)).numpy(),
+                place=at,
                 betas=scene.betas[0, p].double().numpy(),
-                valid=valid,
+                valid=valid & tracked,
                 body=scene.body,
                 at_pelvis=True,
             )
         )
     if not tracks:
         raise DataError(f"{path}: nobody is present in it; {AGAIN}")
-    return tracks
+    return tracks, notes
 
 
 def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -340,9 +346,6 @@ def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
             f"{where}: rotations: got shape {whole.shape}, expected (frames, {WIDTH} or more) in axis-angle, or people "
             f"first{none}; {AGAIN}"
         )
-    if not np.isfinite(whole).all():
-        out = "leave such frames out in all files of the scene"
-        raise DataError(f"{where}: rotations hold NaN or infinity; {out}, or {AGAIN}")
     return whole, whole.shape[-1]
 
 

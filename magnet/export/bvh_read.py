@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.motion.bvh import AXES, BvhHeader, BvhJoint, bvh_header
+from magnet.motion.runs import filled
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 RATES = (23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 119.88, 120.0, 240.0)
 """Rates that a rounded Frame Time such as 0.033333 stands for."""
@@ -28,6 +30,7 @@ class Bvh:
     local: Floats  # (T, K, 3, 3) rotation relative to the parent; all are the identity in the rest pose
     fps: float
     path: Path
+    tracked: Bools | None = None  # (T,) frames that hold no NaN, which `gaps` allows; the others are as the one before
 
     @property
     def frames(self) -> int:
@@ -49,15 +52,19 @@ class Bvh:
         return turned, at
 
 
-def read_bvh(path: str | Path) -> Bvh:
+def read_bvh(path: str | Path, gaps: bool = False) -> Bvh:
     """Read one BVH file.
 
     Position channels of a joint replace its OFFSET, as most programs write them, and are added to it where they
     rather count from there: see `_added`.
 
+    Args:
+        path: the file.
+        gaps: frames may hold NaN or infinity, where tracking was lost: they become `Bvh.tracked`.
+
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no BVH, truncated, or a line makes no sense; names file and line.
+        ValueError: no BVH, truncated, or a line makes no sense; names file and line. NaN in all frames, or in any.
     """
     path = Path(path)
     try:
@@ -67,7 +74,7 @@ def read_bvh(path: str | Path) -> Bvh:
     lines = text.splitlines()
     header = bvh_header(lines, path)
     joints, parents = _without_ends(header.joints)
-    values = _motion(path, lines, header)
+    values, tracked = _motion(path, lines, header, gaps)
     offsets = np.array([joint.offset for joint in joints], dtype=np.float64)
     T, K = len(values), len(joints)
     place = np.broadcast_to(offsets, (T, K, 3)).copy()
@@ -86,7 +93,7 @@ def read_bvh(path: str | Path) -> Bvh:
         if moved:
             place[:, k] = _placed(offsets[k], moved, T, reach)
     names = tuple(joint.name for joint in joints)
-    return Bvh(names, parents, offsets, place, local, _rate(header.seconds, header.digits), path)
+    return Bvh(names, parents, offsets, place, local, _rate(header.seconds, header.digits), path, tracked)
 
 
 def _rest(offsets: Floats, parents: Sequence[int]) -> Floats:
@@ -138,8 +145,8 @@ def _without_ends(written: Sequence[BvhJoint]) -> tuple[list[BvhJoint], tuple[in
     return joints, tuple(number[joint.parent] for joint in joints)
 
 
-def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
-    """All numbers. -> (T, D)"""
+def _motion(path: Path, lines: Sequence[str], header: BvhHeader, gaps: bool) -> tuple[Floats, Bools | None]:
+    """All numbers (T, D); and (T,) which frames were finite, None: all."""
     frames, width = header.frames, header.width
     words = " ".join(lines[header.first :]).split()
     if len(words) != frames * width:
@@ -150,12 +157,15 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> Floats:
         values = np.array(words, dtype=np.float64).reshape(frames, width)
     except ValueError as error:
         raise ValueError(f"{path}: the MOTION part holds something that is no number ({error})") from error
-    if not np.isfinite(values).all():
-        frame = int((~np.isfinite(values).all(axis=1)).argmax())
-        line = header.first + 1 + frame
-        out = "leave such frames out in all files of the scene"
-        raise ValueError(f"{path}:{line}: frame {frame + 1} holds NaN or infinity; {out}")
-    return values
+    finite: Bools = np.logical_and.reduce(np.isfinite(values), axis=1)
+    if finite.all():
+        return values, None
+    if gaps and finite.any():
+        return filled(values[:, None], finite[:, None])[:, 0], finite
+    frame = int((~finite).argmax())
+    line = header.first + 1 + frame
+    out = "every frame does" if not finite.any() else "leave such frames out in all files of the scene"
+    raise ValueError(f"{path}:{line}: frame {frame + 1} holds NaN or infinity; {out}")
 
 
 def _rate(seconds: float, digits: int) -> float:

@@ -42,6 +42,8 @@ def posed(there: Collection[str]) -> bool:
 def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     """Axis-angle numbers a frame, radians, (T, D) or (P, T, D), the pelvis's first, however a file holds them.
 
+    Numbers that are not finite stay so.
+
     Args:
         where: for messages.
         held: what the file has; None counts as absent.
@@ -82,10 +84,12 @@ def _axis_angle(where: object, value: Any, least: int = 0, joints: int | None = 
     with np.errstate(over="ignore", invalid="ignore"):
         array = array.astype(np.float64)
     if array.ndim >= 4 and array.shape[-2:] == (3, 3):
+        known = np.isfinite(array).all(axis=(-2, -1))[..., None]
+        array = np.where(known[..., None], array, np.eye(3))
         square = np.allclose(array @ np.swapaxes(array, -1, -2), np.eye(3), atol=1e-2)
         if not square or (np.linalg.det(array) < 0).any():
             raise ValueError(f"{where}: matrices that are no rotations")
-        array = to_rotvec(torch.from_numpy(array)).numpy()
+        array = np.where(known, to_rotvec(torch.from_numpy(array)).numpy(), np.nan)
     if array.ndim >= 3 and array.shape[-1] == 3 and array.shape[-2] == (joints or array.shape[-2]):
         array = array.reshape(*array.shape[:-2], -1)
     if array.ndim not in (2, 3) or array.shape[-1] < least:

@@ -218,3 +218,46 @@ def test_proportions_that_are_nobodys_are_refused_unless_they_are_asked_for(tmp_
     assert error and re.search(r"mean error of [\d.]+ cm, expected at most 4\.0 cm; worst is \w+", error)
     kept = BVHReader(root, worst_fit=0.3)
     assert convert(kept, kept.found()[0], load_body(), CanonicalizeOptions(min_frames=1, trust_fps=True)).error is None
+
+
+def gapped(root: Path, frames: slice) -> Path:
+    """A walk whose second person was not tracked in some frames."""
+    written(root, walk=walk(240, 120.0))
+    path = next(path for path in root.iterdir() if path.stem.endswith("B"))
+    lines = path.read_text().splitlines()
+    first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    for number in range(first + frames.start, first + frames.stop):
+        lines[number] = " ".join(["nan"] * len(lines[number].split()))
+    path.write_text("\n".join(lines) + "\n")
+    return root
+
+
+def test_frames_of_no_numbers_are_cut_out_and_the_others_stay_as_they_are(tmp_path: Path) -> None:
+    body, options = load_body(), CanonicalizeOptions(min_frames=10, trust_fps=True)
+    written(tmp_path / "whole", walk=walk(240, 120.0))
+    whole_take, gap_take = (
+        whole(BVHReader(root)) for root in (tmp_path / "whole", gapped(tmp_path / "gap", slice(100, 108)))
+    )
+    assert gap_take.valid is not None and np.argwhere(~gap_take.valid).tolist() == [[t, 1] for t in range(100, 108)]
+    assert any("8 of 240 frames hold NaN or infinity, taken as not tracked" in note for note in gap_take.notes)
+    (one,) = canonicalize(whole_take, body, "walk", "bvh", "train", "positions", options).clips
+    first, last = canonicalize(gap_take, body, "walk", "bvh", "train", "positions", options).clips
+    assert (first.name, last.name) == ("walk [0:25]", "walk [27:60]")
+    for clip, part in ((first, slice(0, 25)), (last, slice(27, 60))):
+        close = (body.joints(clip.scene) - body.joints(one.scene)[:, part])[0]
+        close = (close - close[:, :1, :1]).norm(dim=-1)  # each clip has an origin of its own: of the first one's pelvis
+        assert close[:, 0].max() < 1e-4 and close[:, 1].max() < 0.01
+
+
+def test_files_of_other_rates_keep_their_gaps(tmp_path: Path) -> None:
+    reader = BVHReader(gapped(tmp_path, slice(100, 108)))
+    take = next(take for take in reader.found() if take.name == "walk")
+    tracks = [reader.open(PersonFile("", file), False)[0][0] for file in take.files]
+    slow = [track.resampled(30.0) for track in tracks]
+    assert [np.flatnonzero(~track.valid).tolist() for track in slow] == [[], [25, 26]]
+    assert slow[1].slice(26, 30).valid.tolist() == [False, True, True, True]
+
+
+def test_somebody_who_was_never_tracked_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"every frame does"):
+        whole(BVHReader(gapped(tmp_path, slice(0, 240))))

@@ -101,6 +101,48 @@ def test_every_form_shows_the_same_joints(form: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(world_joints(found, "smplx"), TRUE.positions, atol=1e-5)
 
 
+GONE = slice(10, 14)
+"""Frames in which the second person was not tracked."""
+
+
+def lost(held: Any, form: str, p: int, number: float) -> Any:
+    """What a file holds, without the second person in some frames: their rotations or places are no numbers."""
+    if "people first" in form:
+        held["poses"][1, GONE] = number
+        return held
+    if form == "pkl, by name":
+        part, key = held["ben"], "trans"
+    elif form == "pkl, a list":
+        part, key = held[1], "poses"
+    elif p == 0:
+        return held
+    else:
+        part = held.get("smpl", held)
+        key = next(key for key in ("smpl_trans", "body_pose", "poses") if key in part)
+    part[key] = np.array(part[key])  # a copy
+    part[key][GONE] = number
+    return held
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_frames_of_no_numbers_are_not_tracked_and_the_others_stay_as_they_are(
+    form: str, number: float, tmp_path: Path
+) -> None:
+    suffix, held, files = FORMS[form]
+    for p in files:
+        write(tmp_path / f"walk_{'AB'[p]}.{suffix}", lost(held(p), form, p, number))
+    found = read(tmp_path)
+    assert found.valid is not None
+    there = np.ones((TRUE.frames, 2), dtype=bool)
+    there[GONE, 1] = False
+    np.testing.assert_array_equal(found.valid, there)
+    shown = np.abs(world_joints(found, "smplx") - TRUE.positions).max(axis=(2, 3))
+    assert shown[there].max() < 1e-5
+    (note,) = (note for note in found.notes if "NaN" in note)
+    assert "4 of 40 frames hold NaN or infinity, taken as not tracked: cut out" in note
+
+
 def test_both_kinds_of_npz_that_magnet_writes_come_back(tmp_path: Path) -> None:
     body = load_body()
     scene = made()
@@ -170,10 +212,8 @@ REFUSED: dict[str, tuple[Any, str]] = {
         damaged(lambda h: h.update(trans=h["trans"][:-1])),
         r"unequal numbers of frames: rotations 40, translations 39",
     ),
-    "NaN": (
-        damaged(lambda h: h["poses"].__setitem__((3, 4), np.nan)),
-        r"rotations hold NaN or infinity; leave such frames out in all files",
-    ),
+    "NaN": (damaged(lambda h: h["poses"].__setitem__((..., 4), np.nan)), r"every frame holds NaN or infinity"),
+    "shape": (damaged(lambda h: h.update(betas=np.full(10, np.nan))), r"betas: 10 of 10 numbers are NaN or infinite"),
     "few": (
         damaged(lambda h: h.update(poses=h["poses"][:, :40])),
         r"rotations: got shape \(40, 40\), expected \(frames, 66",
@@ -252,3 +292,26 @@ def test_a_store_has_one_folder_by_either_name() -> None:
     assert Prepared(root="here").path == Prepared(path="here").path == Prepared(path="here", root="here").path
     with pytest.raises(ValueError, match="path here and root there are two names of one thing"):
         Prepared(path="here", root="there")
+
+
+def test_a_scene_of_magnets_own_may_lack_frames_of_somebody(tmp_path: Path) -> None:
+    scene = made()
+    root = scene.T_world_root.clone()
+    root[0, 5:7, 1] = torch.nan
+    scene.replace(T_world_root=root).save(tmp_path / "walk.npz")
+    found = read(tmp_path)
+    assert found.valid is not None and np.argwhere(~found.valid).tolist() == [[5, 1], [6, 1]]
+    assert any("person 2: 2 of 40 frames hold NaN or infinity" in note for note in found.notes)
+
+
+def test_a_take_with_a_gap_becomes_two_clips(tmp_path: Path) -> None:
+    long = people(150, 2, 60.0, 3)
+    for p in (0, 1):
+        poses, place = long.poses[:, p].reshape(-1, 66).copy(), long.transl[:, p].copy()
+        poses[70 : 74 if p else 72] = np.nan
+        write(tmp_path / f"walk_{'AB'[p]}.npz", {"poses": poses, "trans": place, "betas": np.zeros(10), "fps": 60.0})
+    options = CanonicalizeOptions(min_frames=16)
+    clips = canonicalize(read(tmp_path), load_body(), "walk", "scenes", "train", "any", options).clips
+    assert [clip.name for clip in clips] == ["walk [0:35]", "walk [37:75]"]
+    for clip in clips:
+        assert clip.scene.body_rot.isfinite().all() and clip.scene.T_world_root.isfinite().all()

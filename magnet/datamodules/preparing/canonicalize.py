@@ -23,7 +23,7 @@ from magnet.datamodules.reading.recording import Axis, DataError, Family, Record
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_quat, quat_from_rotvec, to_quat
-from magnet.motion.runs import true_runs
+from magnet.motion.runs import filled, true_runs
 from magnet.motion.scene import BODY_JOINTS, FPS, Scene, cat_agents
 
 CANONICALIZE_VERSION = 3
@@ -201,8 +201,8 @@ def of_body(recording: Recording, body: Body, source: str, family: Family) -> Re
 def _posed(recording: Recording, valid: NDArray[np.bool_], body: Body) -> tuple[WorldMotion, list[Flag]]:
     place = recording.transl if recording.pelvis is None else recording.pelvis
     assert recording.poses is not None and place is not None and recording.betas is not None
-    poses = check_motion.filled(np.asarray(recording.poses, dtype=np.float64), valid)
-    place = check_motion.filled(np.asarray(place, dtype=np.float64), valid)
+    poses = filled(np.asarray(recording.poses, dtype=np.float64), valid)
+    place = filled(np.asarray(place, dtype=np.float64), valid)
     check_motion.check_apart(place, valid)
     betas = torch.from_numpy(np.array(recording.betas, dtype=np.float64))
     quat = quat_from_rotvec(torch.from_numpy(poses))
@@ -225,7 +225,7 @@ def _fitted(
     recording: Recording, valid: NDArray[np.bool_], body: Body, up: Axis, options: CanonicalizeOptions
 ) -> tuple[WorldMotion, list[Flag]]:
     assert recording.positions is not None
-    positions = check_motion.filled(np.asarray(recording.positions, dtype=np.float64), valid)
+    positions = filled(np.asarray(recording.positions, dtype=np.float64), valid)
     points = resample_points(torch.from_numpy(positions), recording.fps)
     good = resample_valid(valid, recording.fps)
     flags = check_people.frozen(*check_people.held_points(points.numpy()), good)

@@ -78,16 +78,6 @@ def usable(recording: Recording) -> Bools:
     return valid
 
 
-def filled(array: Array, valid: Bools) -> Array:
-    """Fill invalid frames with the last valid frame before them, or else the first one. (T, P, ...)"""
-    if valid.all():
-        return array
-    T = len(valid)
-    seen = np.maximum.accumulate(np.where(valid, np.arange(T)[:, None], -1), axis=0)
-    take = np.where(seen < 0, valid.argmax(axis=0), seen)
-    return array[take, np.arange(valid.shape[1])]
-
-
 def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
     """Check that axis-angle vectors (T, P, 22, 3) are in radians.
 
