@@ -227,6 +227,17 @@ def test_a_motion_is_put_on_the_floor_with_its_own_body(duet: Scene):
     assert torch.allclose(low.T_world_root, magnet.on_floor(duet).T_world_root, atol=1e-5)
 
 
+def test_a_live_partners_answer_and_each_person_are_motions_with_the_body_of_the_past(model: Model, duet: Scene):
+    past = Motion.of(duet.slice(0, 16), load_body())
+    partner = model.partner(past, 0, seed=1)
+    answer = partner.answer(duet.slice(16, 20))
+    assert answer.joints().shape == (1, 4, 2, 22, 3) and partner.past.joints().shape[-2:] == (22, 3)
+    assert answer.model is partner.past.model is past.model and isinstance(answer.slice(0, 2), Motion)
+    people = answer.people()
+    assert isinstance(people, Motion) and people.model is past.model and people.names == ()
+    assert type(duet.people()) is Scene
+
+
 def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
     with pytest.raises(ValueError, match="people: got 201, expected 1 to 200"):
         model.generate(people=201)
