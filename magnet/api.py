@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,7 +82,8 @@ def read(
     Args:
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`.
+        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`. A unit or axis that nobody
+            can have is taken as it is said, with a warning that names what the files look like.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -89,6 +91,8 @@ def read(
     """
     options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps)
     got = formats.read(list(paths), body, options)
+    for warning in formats.warned(got.notes):
+        warnings.warn(warning, stacklevel=2)
     return Motion.of(got.scene, got.body, got.notes)
 
 

@@ -20,6 +20,7 @@ from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
 from magnet.export.npz_files import read_people
 from magnet.export.retarget import load_bvh, together
+from magnet.export.upright import WARNING
 from magnet.export.usd import require_usd, save_usd
 from magnet.files import regular
 from magnet.motion.resample import resampled
@@ -116,6 +117,12 @@ def read(
     labels = [str(file) for file in files]
     scene = together(scenes, labels, fps=options.fps, trim=options.trim)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
+
+
+def warned(notes: Sequence[str]) -> list[str]:
+    """The warnings among the notes of what was read, a line each."""
+    lines = [line.strip() for note in notes for line in note.splitlines()]
+    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
 
 
 def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[bool]) -> Read:
