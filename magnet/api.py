@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.body.floor import open_body
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats
@@ -138,6 +139,7 @@ class Model:
         Raises:
             ValueError: more than 200 people.
         """
+        require_whole("frames", frames, 1)  # `predict` would take None for the frames of the scene
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         scene = crowd_from_nothing(people, torch.Generator().manual_seed(self._generator(seed).initial_seed()))
         if people <= self.most_people:
@@ -237,7 +239,7 @@ class Model:
         Raises:
             ValueError: as `magnet.generation.partner.Partner`.
         """
-        plain, body = (past.plain(), past.model) if isinstance(past, Motion) else (past, None)
+        plain, body = _with_its_body(past, "past")
         how = (_slots("agents", agents), self.sampler, self._generator(seed))
         partner = LivePartner(self.denoiser, plain, *how)
         partner.model = body
@@ -265,7 +267,7 @@ class Model:
             ValueError: no such task, or a scene it makes no sense on; says what to do.
         """
         kind = registry.get(task)
-        require_rate(scene)
+        plain, body = _with_its_body(scene)
         slots = scene.agents
         require_whole("context", context, 0)
         require_whole("samples", samples, 1)
@@ -281,12 +283,11 @@ class Model:
             raise ValueError(f"task {task} has no field {strange[0]}; {has}")
         chosen: Task = kind(**fields)
         generator = self._generator(seed)
-        plain = scene.plain() if isinstance(scene, Motion) else scene
         how = (context, frames, samples, self.sampler, generator)
         sample = generate if slots <= self.most_people else generate_crowd
         sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
-        return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
+        return Motion.of(shown, body)
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)
@@ -309,6 +310,23 @@ class LivePartner(Partner):
     def answer(self, frames: Scene) -> Motion:
         """As `Partner.answer`."""
         return Motion.of(super().answer(frames), self.model)
+
+
+def _with_its_body(scene: Scene, label: str = "the scene") -> tuple[Scene, Body | None]:
+    """The plain scene and the body of its shapes, None for the open one.
+
+    Raises:
+        ValueError: no scene, another frame rate than the models', or shapes of a body that was not given.
+    """
+    require_rate(scene, label)
+    plain, body = (scene.plain(), scene.model) if isinstance(scene, Motion) else (scene, None)
+    given = open_body().id if body is None else body.id
+    if scene.body != given:
+        raise ValueError(
+            f"{label}: its shapes belong to body {scene.body!r}, not {given!r}; give its file, "
+            "magnet.read(..., body=FILE) or Motion.of(scene, magnet.load_body(FILE))"
+        )
+    return plain, body
 
 
 def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:

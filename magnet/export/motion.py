@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import html
+import inspect
 import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,10 @@ from magnet.export import formats
 from magnet.motion.scene import Scene
 
 Player = Literal["page", "film"]
+OPTIONS = tuple(
+    name for name, one in inspect.signature(formats.write).parameters.items() if one.kind is one.KEYWORD_ONLY
+)
+"""Options of `Motion.save`."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,12 +65,18 @@ class Motion(Scene):
             The path written; the first one if a format needs several files (one BVH per person).
 
         Raises:
-            ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
+            ValueError: a suffix that nothing writes, no such option, or a scene that the format cannot hold.
         """
         path = Path(path)
+        if strange := [name for name in options if name not in OPTIONS]:
+            raise ValueError(f"save: got option {strange[0]}, expected {', '.join(OPTIONS)}")
+        formats.require_frames(self)
         if path.suffix == ".npz" and not options:
             return super().save(path)
-        return formats.write(self.plain(), path, self._body(), **{"context_frames": self.context, **options})[0]
+        written = formats.write(self.plain(), path, self._body(), **{"context_frames": self.context, **options})
+        if others := formats.left_over_said(written):
+            warnings.warn(others, stacklevel=2)
+        return written[0]
 
     @property
     def context(self) -> int:

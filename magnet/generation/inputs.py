@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from magnet.body.base import MOST_SHAPE
 from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
@@ -74,10 +77,12 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
         ValueError: NaN, infinities or what is no rotation, another unit than metres or axis than y, or everybody
             stands far from the floor; names scene, agent and frame, and what to do.
     """
-    unshaped = ~scene.betas.isfinite().all(dim=-1) & scene.present
+    unshaped = ~(scene.betas.abs() <= MOST_SHAPE).all(dim=-1) & scene.present  # also of NaN
     if bool(unshaped.any()):
         b, agent = unshaped.nonzero()[0].tolist()
-        raise ValueError(f"{label(scene, b)}, agent {agent}: betas are not finite; zeros are an average body")
+        most = float(scene.betas[b, agent].abs().max())
+        said = f"go up to {most:.3g}, expected at most {MOST_SHAPE:g}" if math.isfinite(most) else "are not finite"
+        raise ValueError(f"{label(scene, b)}, agent {agent}: betas {said}; zeros are an average body")
     keep = known.repeat_interleave(TOKEN_FRAMES, dim=0)[: scene.frames].to(scene.device)
     frames = keep.any(dim=1).nonzero()[:, 0]
     if not len(frames):
