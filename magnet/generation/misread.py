@@ -140,8 +140,8 @@ def _turned(scene: Scene, low: Tensor, counts: Tensor) -> str:
     turn = ", ".join(str([int(number) for number in row]) for row in T_new_world)
     return (
         f"people stand along {name} and not along y, which points up in scenes: turn it, "
-        f"scene.transformed(torch.tensor([{turn}]).float()), then magnet.on_floor(scene); of files say the axis: "
-        f"magnet.read(..., up={name!r}), --up={name}"
+        f"scene.transformed(torch.tensor([{turn}]).float()), then magnet.on_floor(scene); where it was read with "
+        "--up (up=...), leave that out or say another axis"
     )
 
 
