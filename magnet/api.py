@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import html
-import tempfile
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.body import Body, load_body, on_floor
+from magnet.body import Body
+from magnet.body.floor import open_body
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats
+from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
 from magnet.generation.partner import Partner
@@ -30,7 +30,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.base import Task
 
-Player = Literal["page", "film"]
+__all__ = ["Model", "Motion", "NotebookView", "load", "read"]
 
 
 def load(
@@ -83,7 +83,8 @@ def read(
     Args:
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`.
+        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`. A unit or axis that nobody
+            can have is taken as it is said, with a warning that names what the files look like.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -91,111 +92,9 @@ def read(
     """
     options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps)
     got = formats.read(list(paths), body, options)
+    for warning in formats.warned(got.notes):
+        warnings.warn(warning, stacklevel=2)
     return Motion.of(got.scene, got.body, got.notes)
-
-
-# -- scenes that show themselves ---------------------------------------------------------------
-
-
-@dataclass(frozen=True, repr=False)
-class Motion(Scene):
-    """A scene with its body, which can show and save itself; usable wherever a `Scene` is."""
-
-    model: Body | None = None  # the body model `betas` belong to; None: the open one
-    notes: tuple[str, ...] = ()  # notes on how it was read
-
-    @classmethod
-    def of(cls, scene: Scene, model: Body | None = None, notes: Sequence[str] = ()) -> Motion:
-        """A `Motion` of a scene."""
-        fields = {**scene.tensors(), "fps": scene.fps, "body": scene.body, "names": scene.names}
-        return cls(**fields, model=model, notes=tuple(notes))  # type: ignore[arg-type]
-
-    def plain(self) -> Scene:
-        """The plain `Scene`."""
-        tensors = self.tensors()
-        return Scene(**tensors, fps=self.fps, body=self.body, names=self.names)
-
-    def joints(self) -> Tensor:
-        """World joints of everybody. -> (B, T, P, 22, 3) metres"""
-        return self._body().joints(self)
-
-    def vertices(self) -> Tensor:
-        """World vertices of everybody. -> (B, T, P, V, 3) metres"""
-        return self._body().vertices(self)
-
-    def on_floor(self) -> Motion:
-        """The same motion with the lowest standing person on y = 0, the models' floor; for each scene separately."""
-        return Motion.of(on_floor(self.plain(), self._body()), self.model, self.notes)
-
-    def save(self, path: str | Path, **options: Any) -> Path:
-        """Write the format of the path's suffix: .npz .bvh .glb .csv .html .mp4 .gif .webp .png.
-
-        Options are those of `magnet.export.formats.write`: fps, unit, smplx, style, title.
-
-        Returns:
-            The path written; the first one if a format needs several files (one BVH per person).
-
-        Raises:
-            ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
-        """
-        path = Path(path)
-        if path.suffix == ".npz" and not options:
-            return super().save(path)
-        return formats.write(self.plain(), path, self._body(), **{"context_frames": self.context, **options})[0]
-
-    @property
-    def context(self) -> int:
-        """Number of first frames that were given of everybody."""
-        if self.given is None:
-            return 0
-        whole = (self.given | ~self.present[:, None]).all(dim=0).all(dim=1)
-        return int(whole.long().cumprod(dim=0).sum())
-
-    def show(self, scene: int | None = None, player: Player = "page", **options: Any) -> NotebookView:
-        """A view that a notebook plays inline.
-
-        Args:
-            scene: number of the scene to show; None: all B scenes, side by side.
-            player: `page`, an interactive player that needs no server, or `film`, an animated picture.
-            options: options of `save` for that kind: style, title, fps.
-        """
-        if player not in get_args(Player):
-            raise ValueError(f"player: got {player!r}, expected {' or '.join(get_args(Player))}")
-        if scene is not None:
-            require_whole("scene", scene, 0, self.scenes - 1)
-        shown = self if scene is None else Motion.of(self.select([scene]), self.model)
-        with tempfile.TemporaryDirectory() as folder:
-            kind = {"page": ".html", "film": ".webp"}[player]
-            if player == "film":
-                options = {"style": "skeleton", "fps": 15.0, **options}
-            path = shown.save(Path(folder) / f"scene{kind}", **options)
-            return NotebookView(path.read_bytes(), kind)
-
-    def _body(self) -> Body:
-        return self.model or load_body("open")
-
-
-@dataclass(frozen=True, repr=False)
-class NotebookView:
-    """A page or a film: notebooks play it inline; elsewhere `save` it."""
-
-    data: bytes
-    kind: str  # .html or .webp
-
-    def _repr_html_(self) -> str:
-        if self.kind == ".html":
-            page = html.escape(self.data.decode(), quote=True)
-            return f'<iframe srcdoc="{page}" style="width:100%;height:520px;border:0" allowfullscreen></iframe>'
-        return f'<img alt="scene" src="data:image/webp;base64,{base64.b64encode(self.data).decode()}">'
-
-    def save(self, path: str | Path) -> Path:
-        """Write it to a file, for a browser. Returns the path written."""
-        path = Path(path).with_suffix(self.kind)
-        path.write_bytes(self.data)
-        return path
-
-    def __repr__(self) -> str:
-        return f"a {len(self.data) / 1e6:.1f} MB {self.kind}, played in notebooks; elsewhere .save('scene{self.kind}')"
 
 
 # -- a model -----------------------------------------------------------------------------------
@@ -240,6 +139,7 @@ class Model:
         Raises:
             ValueError: more than 200 people.
         """
+        require_whole("frames", frames, 1)  # `predict` would take None for the frames of the scene
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         scene = crowd_from_nothing(people, torch.Generator().manual_seed(self._generator(seed).initial_seed()))
         if people <= self.most_people:
@@ -327,8 +227,10 @@ class Model:
         target = _slots("agent", agent)
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=target)
 
-    def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> Partner:
+    def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> LivePartner:
         """Agents who react live: pass the others' newest frames, at least 4, to `partner(past).answer(frames)`.
+
+        Answers are `Motion`s, with the body of `past`.
 
         Args:
             past: recent motion of everybody; a second is enough.
@@ -337,8 +239,11 @@ class Model:
         Raises:
             ValueError: as `magnet.generation.partner.Partner`.
         """
-        plain = past.plain() if isinstance(past, Motion) else past
-        return Partner(self.denoiser, plain, _slots("agents", agents), self.sampler, self._generator(seed))
+        plain, body = _with_its_body(past, "past")
+        how = (_slots("agents", agents), self.sampler, self._generator(seed))
+        partner = LivePartner(self.denoiser, plain, *how)
+        partner.model = body
+        return partner
 
     def predict(
         self,
@@ -362,7 +267,7 @@ class Model:
             ValueError: no such task, or a scene it makes no sense on; says what to do.
         """
         kind = registry.get(task)
-        require_rate(scene)
+        plain, body = _with_its_body(scene)
         slots = scene.agents
         require_whole("context", context, 0)
         require_whole("samples", samples, 1)
@@ -378,12 +283,11 @@ class Model:
             raise ValueError(f"task {task} has no field {strange[0]}; {has}")
         chosen: Task = kind(**fields)
         generator = self._generator(seed)
-        plain = scene.plain() if isinstance(scene, Motion) else scene
         how = (context, frames, samples, self.sampler, generator)
         sample = generate if slots <= self.most_people else generate_crowd
         sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
-        return Motion.of(shown, scene.model if isinstance(scene, Motion) else None)
+        return Motion.of(shown, body)
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)
@@ -391,6 +295,38 @@ class Model:
             require_whole("seed", seed, -(2**63), 2**63 - 1)
         generator.manual_seed(int(seed)) if seed is not None else generator.seed()  # NumPy's numbers are no int
         return generator
+
+
+class LivePartner(Partner):
+    """A `Partner` whose answers and past are `Motion`s, which show and save themselves."""
+
+    model: Body | None = None
+    """The body model of the past; None: the open one."""
+
+    @property
+    def past(self) -> Motion:
+        return Motion.of(super().past, self.model)
+
+    def answer(self, frames: Scene) -> Motion:
+        """As `Partner.answer`."""
+        return Motion.of(super().answer(frames), self.model)
+
+
+def _with_its_body(scene: Scene, label: str = "the scene") -> tuple[Scene, Body | None]:
+    """The plain scene and the body of its shapes, None for the open one.
+
+    Raises:
+        ValueError: no scene, another frame rate than the models', or shapes of a body that was not given.
+    """
+    require_rate(scene, label)
+    plain, body = (scene.plain(), scene.model) if isinstance(scene, Motion) else (scene, None)
+    given = open_body().id if body is None else body.id
+    if scene.body != given:
+        raise ValueError(
+            f"{label}: its shapes belong to body {scene.body!r}, not {given!r}; give its file, "
+            "magnet.read(..., body=FILE) or Motion.of(scene, magnet.load_body(FILE))"
+        )
+    return plain, body
 
 
 def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:

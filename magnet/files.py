@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -80,7 +80,7 @@ def require_place(path: str | Path) -> None:
     """Refuse a path at which no file can be written, before what it is to hold is made.
 
     Raises:
-        CannotWrite: a folder lies there, what should be its folder is a file, or it may not be written.
+        CannotWrite: a folder lies there, what should be its folder is a file, or cannot be made or written.
     """
     path = Path(path)
     if path.is_dir():
@@ -90,6 +90,26 @@ def require_place(path: str | Path) -> None:
         raise CannotWrite(f"{path}: {there} is a file, expected a folder")
     if not os.access(there, os.W_OK):
         raise CannotWrite(f"{path}: {there} may not be written to; give yourself the right to, or choose another place")
+    if there is not path:
+        _try_folder(path)
+
+
+def _try_folder(path: Path) -> None:
+    """Make the folder of a file that is to be written, and a file in it, and take away again what was made."""
+    folder = path.absolute().parent
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        if error.errno in FULL:
+            raise CannotWrite(f"{path}: the disk is full{_space(path)}: free some space, or choose another") from error
+        what = "be made" if made else "take a file"
+        raise CannotWrite(f"{path}: {folder} cannot {what} ({error.strerror}); choose another place") from error
+    finally:
+        for each in made:
+            with suppress(OSError):  # somebody else may have put something there
+                each.rmdir()
 
 
 class HashedFile:
@@ -197,6 +217,22 @@ def inside(folder: Path, name: Any) -> Path:
     if not isinstance(name, str) or name in ("", ".", "..") or set("/\\\0") & set(name):
         raise Refused(f"{folder}: its index names {name!r:.80}, expected the name of a file in it; make it anew")
     return folder / name
+
+
+def npz_path(path: str | Path, others: str) -> Path:
+    """The path of an npz, with its suffix where there is none.
+
+    Args:
+        path: of an npz, with its suffix or without any.
+        others: what the message says of other suffixes.
+
+    Raises:
+        ValueError: the path has another suffix.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in ("", ".npz"):
+        raise ValueError(f"{path.name}: got suffix {path.suffix}, expected .npz or none; {others}")
+    return path if path.suffix else path.with_name(path.name + ".npz")
 
 
 def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -52,6 +52,8 @@ def device_of(device: str | torch.device) -> torch.device:
         place = torch.device(device)
     except (RuntimeError, TypeError) as error:
         raise ValueError(f"device: got {device!r}, expected cpu, cuda, cuda:0 or mps") from error
+    if place.type == "meta":
+        raise ValueError(f"device: got {device!r}, which holds no numbers, expected cpu, cuda, cuda:0 or mps")
     there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if not there.get(place.type, True):
         raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")

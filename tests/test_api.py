@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import re
@@ -227,6 +228,24 @@ def test_a_motion_is_put_on_the_floor_with_its_own_body(duet: Scene):
     assert torch.allclose(low.T_world_root, magnet.on_floor(duet).T_world_root, atol=1e-5)
 
 
+def test_a_live_partners_answer_and_each_person_are_motions_with_the_body_of_the_past(model: Model, duet: Scene):
+    past = Motion.of(duet.slice(0, 16), load_body())
+    partner = model.partner(past, 0, seed=1)
+    answer = partner.answer(duet.slice(16, 20))
+    assert answer.joints().shape == (1, 4, 2, 22, 3) and partner.past.joints().shape[-2:] == (22, 3)
+    assert answer.model is partner.past.model is past.model and isinstance(answer.slice(0, 2), Motion)
+    people = answer.people()
+    assert isinstance(people, Motion) and people.model is past.model and people.names == ()
+    assert type(duet.people()) is Scene
+
+
+def test_a_scene_with_its_own_body_is_continued_and_keeps_it(model: Model, duet: Scene):
+    body = copy.deepcopy(load_body())
+    body.id = "mine"
+    motion = model.continue_(Motion.of(duet.replace(body="mine"), body), 8, seed=1)
+    assert (motion.body, motion.model) == ("mine", body) and motion.joints().isfinite().all()
+
+
 def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
     with pytest.raises(ValueError, match="people: got 201, expected 1 to 200"):
         model.generate(people=201)
@@ -269,6 +288,19 @@ CARELESS = {
     "body differ: open-1 and mine": lambda model, duet: model.partner(duet).answer(
         duet.slice(0, 4).replace(body="mine")
     ),
+    "frames: got None, expected a whole number": lambda model, duet: model.generate(2, frames=None),
+    "the scene: its shapes belong to body 'smplx', not 'open-1'; give its file": lambda model, duet: model.continue_(
+        duet.replace(body="smplx"), 8
+    ),
+    "past: its shapes belong to body 'smplx', not 'open-1'": lambda model, duet: model.partner(
+        duet.replace(body="smplx")
+    ),
+    "agent 0: betas go up to 50, expected at most 12": lambda model, duet: model.continue_(
+        duet.replace(betas=torch.full_like(duet.betas, 50.0))
+    ),
+    "device: got 'meta', which holds no numbers": lambda model, duet: magnet.load(device="meta"),
+    "save: got option foo, expected fps, unit, smplx": lambda model, duet: Motion.of(duet).save("a.glb", foo=1),
+    "the scene has 0 frames of 2 people": lambda model, duet: Motion.of(duet.slice(0, 0)).save("a.npz"),
     "context: got 16.0, expected a whole number": lambda model, duet: model.continue_(duet, context=16.0),
     "context: got '32', expected a whole number": lambda model, duet: model.predict(duet, context="32"),
     "context: got -4, expected at least 0": lambda model, duet: model.predict(duet, context=-4),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from magnet import files
-from magnet.files import CannotWrite, inside, load_npz, regular, require_place, write_whole, writing
+from magnet.files import CannotWrite, inside, load_npz, npz_path, regular, require_place, write_whole, writing
 
 HERE = "choose another --out"
 
@@ -42,6 +42,25 @@ def test_a_place_is_known_before_there_is_anything_to_write(tmp_path: Path, monk
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(CannotWrite, match=r"file: .* may not be written to; give yourself the right to"):
         require_place(tmp_path / "new" / "file")
+
+
+def test_a_folder_that_the_system_does_not_make_is_known_before_there_is_anything_to_write(tmp_path: Path) -> None:
+    if not Path("/proc/self").exists():
+        pytest.skip("no /proc here")
+    for path in ("/proc/nowhere/file.npz", "/proc/file.npz"):
+        with pytest.raises(CannotWrite, match=rf"^{path}: /proc\S* cannot .+; choose another place$") as caught:
+            require_place(path)
+        assert "Errno" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name, path", [("a", "a.npz"), ("a.npz", "a.npz"), ("a.NPZ", "a.NPZ"), ("b.c/a", "b.c/a.npz")])
+def test_an_npz_has_its_suffix(name: str, path: str) -> None:
+    assert npz_path(name, "") == Path(path)
+
+
+def test_an_npz_has_no_other_suffix() -> None:
+    with pytest.raises(ValueError, match=r"a\.glb: got suffix \.glb, expected \.npz or none; use x"):
+        npz_path("b/a.glb", "use x")
 
 
 def test_a_real_full_device_is_told_as_such() -> None:

@@ -27,6 +27,8 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 
 SHAPES = 10
 """Shape numbers of a body; a file may have more, which are ignored."""
+MOST_SHAPE = 12.0
+"""Standard deviations that no shape number is off the mean; fits of real people stay below 6."""
 
 
 def _depths() -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:

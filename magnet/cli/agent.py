@@ -90,8 +90,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     import torch
 
     from magnet.api import read
-    from magnet.files import require_place
+    from magnet.files import npz_path, require_place
 
+    if given.out is not None:
+        given.out = npz_path(given.out, "of it `magnet export` makes other formats")
     for out in filter(None, (given.out, given.report)):  # written when it is over
         require_place(out)
     torch.set_num_threads(given.threads)

@@ -117,7 +117,7 @@ def main(arguments: Sequence[str]) -> int:
             raise CommandError(f"--{name} {value}: expected at least {least}")
     size, one = tuple(options.size), options.samples == 1
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
-    from magnet.api import Model
+    from magnet.api import Model, Motion
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.core import DenoiserCore
 
@@ -136,7 +136,13 @@ def main(arguments: Sequence[str]) -> int:
     scene, context, frames = lengths(options, task, scene, added, model)
     began = time.perf_counter()
     made = model.predict(
-        scene, task.name, context=context, frames=frames, seed=options.seed, samples=options.samples, **task.fields
+        Motion.of(scene, body),
+        task.name,
+        context=context,
+        frames=frames,
+        seed=options.seed,
+        samples=options.samples,
+        **task.fields,
     )
     took = time.perf_counter() - began
     seen = f", of which {made.scenes * made.context} are given," if made.context else ""

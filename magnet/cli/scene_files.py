@@ -145,7 +145,11 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
 
 
 def say_written(paths: Iterable[Path]) -> None:
-    """Name the files that were written, with their sizes."""
-    for path in paths:
+    """Name the files that were written, with their sizes, and files beside them that look like part of the scene."""
+    from magnet.export.formats import left_over_said
+
+    for path in (written := list(paths)):
         count = path.stat().st_size
         print(f"written: {path} ({f'{count / 1e6:.1f} MB' if count >= 1e5 else f'{count / 1e3:.1f} kB'})")
+    if said := left_over_said(written):
+        print(said)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
 from magnet.export.npz_files import read_people
 from magnet.export.retarget import load_bvh, together
+from magnet.export.upright import WARNING
 from magnet.export.usd import require_usd, save_usd
 from magnet.files import regular
 from magnet.motion.resample import resampled
@@ -86,7 +88,9 @@ def read(
     suffixes = {file.suffix.lower() for file in files}
     if len(suffixes) != 1 or not suffixes <= set(READ):
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
-        raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind")
+        also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
+        only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
+        raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind{only}")
     for file in files:
         if not file.exists():
             raise FileNotFoundError(f"{file}: no such file")
@@ -116,6 +120,12 @@ def read(
     labels = [str(file) for file in files]
     scene = together(scenes, labels, fps=options.fps, trim=options.trim)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
+
+
+def warned(notes: Sequence[str]) -> list[str]:
+    """The warnings among the notes of what was read, a line each."""
+    lines = [line.strip() for note in notes for line in note.splitlines()]
+    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
 
 
 def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[bool]) -> Read:
@@ -293,6 +303,7 @@ def write(
     suffix = path.suffix.lower()
     if suffix not in WRITTEN:
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(WRITTEN)}")
+    require_frames(scene)
     kind, apart = WRITTEN[suffix], suffix == ".npz" and smplx
     body = body or load_body("open")
     if scene.body != body.id:
@@ -331,6 +342,37 @@ def files_of(path: Path, people: Sequence[int], smplx: bool = False, each: bool 
     if path.suffix.lower() != ".bvh":
         return places
     return [file for place, count in zip(places, people, strict=True) for file in paths_of(place, count)]
+
+
+def left_over(written: Sequence[Path]) -> list[Path]:
+    """Files of further people beside those just written, out_2.bvh beside out_0.bvh and out_1.bvh: of another scene."""
+    found: list[Path] = []
+    for last in (path for path in written if path.stem.rpartition("_")[2].isdecimal()):
+        base, _, number = last.stem.rpartition("_")
+        if last.with_name(f"{base}_0{last.suffix}") not in written or len(written) < 2:
+            continue  # a number that is part of the name
+        beside = (last.with_name(f"{base}_{k}{last.suffix}") for k in itertools.count(int(number) + 1))
+        found += [each for each in itertools.takewhile(Path.exists, beside) if {each}.isdisjoint({*written, *found})]
+    return found
+
+
+def left_over_said(written: Sequence[Path]) -> str:
+    """A sentence that names the files of `left_over`; empty if there are none."""
+    others = left_over(written)
+    one = len(others) == 1
+    said = "lies beside what was written and is" if one else "lie beside what was written and are"
+    names = ", ".join(path.name for path in others)
+    return f"{names}: {said} no part of it; remove {'it' if one else 'them'} if no longer needed" if others else ""
+
+
+def require_frames(scene: Scene) -> None:
+    """Refuse a scene without frames, of which no file could be read again.
+
+    Raises:
+        ValueError: it has none.
+    """
+    if not scene.frames:
+        raise ValueError(f"the scene has 0 frames of {scene.agents} people: there is nothing to write")
 
 
 def require_finite(scene: Scene, instead: str = "cut such frames out, or write .npz") -> None:

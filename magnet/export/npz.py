@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from magnet.export.smpl_keys import (
     first_of,
     rotations,
 )
-from magnet.export.upright import Stance, axis_of, stance
+from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -218,6 +218,30 @@ def stance_in(scene: Scene, body: Body, up: str, sure: bool) -> Stance:
     return Stance(up, up, up if sure else None, moved, np.min([one.low for one in each], axis=0))
 
 
+def clear_axes(scene: Scene, up: str) -> list[str]:
+    """Along which axis of their file people stand who were read with `up`; `up` itself for whom it is not clear."""
+    torsos = scene.T_world_root[..., :3, 1].double().mean(dim=1)[scene.present].cpu().numpy() @ UP[up]
+    return [axis_of(torso) if np.abs(torso).max() >= LONG else up for torso in torsos]
+
+
+def unit_against(scenes: Sequence[Scene], unit: str) -> list[str]:
+    """A warning where the unit that was said leaves nobody at a person's height, and another does."""
+    heights = [float(scene.T_world_root[..., 1, 3].median()) for scene in scenes if scene.frames]
+    if not heights or any(LYING <= height <= STANDING[1] for height in heights):
+        return []
+    rest = SMPLX_PELVIS[1]  # is in metres whatever the unit of places
+    for other in ("m", "cm", "mm"):
+        as_other = [(height - rest) / UNITS[unit] * UNITS[other] + rest for height in heights]
+        if all(STANDING[0] <= height <= STANDING[1] for height in as_other):
+            return [
+                f"{WARNING}unit {unit}, as said, puts pelvises {heights[0]:.2g} m over y = 0; the files look like "
+                f"{other}: --in_unit {other} (unit={other!r})"
+            ]
+    return []
+
+
+STANDING, LYING = (0.4, 1.4), 0.15
+"""Metres of a pelvis over the floor: of who stands or sits, and at least."""
 HIGHEST, MOST_TURNED = 30.0, 9.0
 """Metres of a pelvis over the floor, and radians of a turn, which files in metres and radians do not hold."""
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magnet.body import Body
-from magnet.export.npz import is_open, read_smplx, require_rate, stance_in
+from magnet.export.npz import clear_axes, is_open, read_smplx, require_rate, stance_in, unit_against
 from magnet.export.smpl_keys import posed
-from magnet.export.upright import agreed, said
+from magnet.export.upright import agreed, said, told_against
 from magnet.files import load_npz
 from magnet.motion.scene import Scene
 
@@ -40,7 +40,9 @@ def read_people(
     people = [_read(file, body, up, unit, in_fps) for file in files]
     if up is None and len(people) > 1:
         people = _of_one_axis(files, people, body, unit, in_fps)
-    return people
+    warned = told_against(up, [axis for one in people for axis in clear_axes(one.scene, up)]) if up else []
+    warned += unit_against([one.scene for one in people], unit) if unit else []
+    return [replace(people[0], notes=[*people[0].notes, *warned]), *people[1:]] if warned else people
 
 
 def _of_one_axis(

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.base import Body
+from magnet.body.base import MOST_SHAPE, Body
 
 from magnet.body.joints import (  # isort: skip
     ANKLES, COLLARS, ELBOWS, JOINT_NAMES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PARENTS,
@@ -131,7 +131,7 @@ def load_bvh(
             f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
         )
     skeletons = understood_together(files, unit, up, joints)
-    read = [onto(skeleton, body) for skeleton in skeletons]
+    read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     sources = tuple(replace(how, jumps=_jumps(each)) for (_, how), each in zip(read, skeletons, strict=True))
     labels = [str(path) for path in each]
     scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)

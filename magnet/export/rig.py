@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magnet.body.joints import HIPS, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS
 from magnet.export.bvh_read import Bvh
 from magnet.export.naming import Naming, recognised
-from magnet.export.upright import Stance, agreed, said, stance
+from magnet.export.upright import WARNING, Stance, agreed, said, stance, told_against
 
 Floats = NDArray[np.float64]
 
@@ -77,6 +77,9 @@ def understood_together(
     for k, (file, naming) in enumerate(zip(files, namings, strict=True)):
         notes = [] if unit else _of_unit(legs, units, k)
         notes += [] if up else said(stances, ups, k)
+        if k == 0:  # of all files together, once
+            notes += _against_unit(legs, unit) if unit else []
+            notes += told_against(up, agreed(stances)) if up else []
         found.append(_skeleton(file, naming, units[k], ups[k], *moved[k], tuple(notes)))
     return found
 
@@ -124,6 +127,17 @@ def _of_unit(legs: Sequence[float], units: Sequence[str], k: int) -> list[str]:
     if not SHORTEST_LEG <= leg <= LONGEST_LEG:
         return [f"legs are {100 * leg:.0f} cm long if its unit is that of the others, which is taken to be so"]
     return []
+
+
+def _against_unit(legs: Sequence[float], unit: str) -> list[str]:
+    """A warning where the unit that was said leaves nobody with legs of a person's length."""
+    if any(CHILDS_LEG <= leg * UNITS[unit] <= GIANTS_LEG for leg in legs):
+        return []
+    fit = next((name for name in UNITS if all(SHORTEST_LEG <= leg * UNITS[name] <= LONGEST_LEG for leg in legs)), None)
+    looks = (
+        f"; the files look like {fit}: --in_unit {fit} (unit={fit!r})" if fit in UNITS and " " not in str(fit) else ""
+    )
+    return [f"{WARNING}unit {unit}, as said, makes legs {legs[0] * UNITS[unit]:.2g} m long{looks}"]
 
 
 def _stance(file: Bvh, naming: Naming, leg: float, at: Floats) -> Stance:

@@ -139,3 +139,18 @@ def said(stances: Sequence[Stance], ups: Sequence[str], k: int) -> list[str]:
     if len(set(ups)) > 1:
         notes.append(f"files have different axes that point up, this one {ups[k]}; if all have the same, say --up")
     return notes
+
+
+WARNING = "warning: "
+"""How a note begins that tells of a likely mistake."""
+
+
+def told_against(up: str, found: Sequence[str]) -> list[str]:
+    """A warning where the axis that was said is nobody's. found: the axis of each file by its motion"""
+    if not found or up in found:
+        return []
+    theirs = max(found, key=found.count)
+    return [
+        f"{WARNING}up {up}, as said, leaves nobody upright; the files look like {theirs} up: --up={theirs} "
+        f"(up={theirs!r}) stands people up, unless all lie"
+    ]

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from magnet.body.base import MOST_SHAPE
 from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import label
+from magnet.generation.misread import misread, steps_of
 from magnet.motion.scene import Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 
 ROUNDED = 0.05
 """What a rotation's columns may be off: half precision and careless interpolation are not refused, scales are."""
+
+ANY_FLOOR = "give any_floor=True (--sampler.any_floor true)"
 
 
 def check_request(
@@ -65,16 +71,18 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     Args:
         scene: B recordings; of frames beyond them nothing is known.
         known: token steps that are read.
-        any_floor: accept people who stand far from y = 0.
+        any_floor: accept people who stand far from y = 0, and whatever looks like another unit or up axis.
 
     Raises:
-        ValueError: NaN, infinities or what is no rotation, or everybody stands far from the floor; names scene, agent
-            and frame, and what to do.
+        ValueError: NaN, infinities or what is no rotation, another unit than metres or axis than y, or everybody
+            stands far from the floor; names scene, agent and frame, and what to do.
     """
-    unshaped = ~scene.betas.isfinite().all(dim=-1) & scene.present
+    unshaped = ~(scene.betas.abs() <= MOST_SHAPE).all(dim=-1) & scene.present  # also of NaN
     if bool(unshaped.any()):
         b, agent = unshaped.nonzero()[0].tolist()
-        raise ValueError(f"{label(scene, b)}, agent {agent}: betas are not finite; zeros are an average body")
+        most = float(scene.betas[b, agent].abs().max())
+        said = f"go up to {most:.3g}, expected at most {MOST_SHAPE:g}" if math.isfinite(most) else "are not finite"
+        raise ValueError(f"{label(scene, b)}, agent {agent}: betas {said}; zeros are an average body")
     keep = known.repeat_interleave(TOKEN_FRAMES, dim=0)[: scene.frames].to(scene.device)
     frames = keep.any(dim=1).nonzero()[:, 0]
     if not len(frames):
@@ -95,14 +103,18 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     if any_floor:
         return
     few = torch.linspace(0, len(frames) - 1, min(len(frames), MOMENTS), device=scene.device).long()
-    off = off_floor(lowest(part.frames_at(few)), counts[:, few], counts.sum(dim=1))
+    moments = part.frames_at(few)
+    low = lowest(moments)
+    if strange := misread(moments, counts[:, few], low, steps_of(part, counts, frames, MOMENTS)):
+        raise ValueError(f"{label(scene, strange[0])}: {strange[1]}; if it is really so, {ANY_FLOOR}")
+    off = off_floor(low, counts[:, few], counts.sum(dim=1))
     if bool((off != 0).any()):
         b = int(off.abs().argmax())
         metres = float(off[b])
         raise ValueError(
             f"{label(scene, b)}: everybody stands {abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, the "
             "model's floor: move them there with magnet.on_floor(scene) or magnet export --on_floor; if they really "
-            "are off the floor, give any_floor=True (--sampler.any_floor true)"
+            f"are off the floor, {ANY_FLOOR}"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,6 +67,9 @@ def bvh_header(lines: Sequence[str], path: object) -> BvhHeader:
     try:
         frames, seconds = int(head["frames"]), float(head["frame time"])
     except (KeyError, ValueError) as error:
+        if re.fullmatch(r"\d*,\d+", said := head.get("frame time", "").strip()):
+            comma = f"Frame Time: {said} has a decimal comma, expected a point as in 0.0333333: mend the file's numbers"
+            raise ValueError(f"{path}:{begin + 3}: {comma}, or export it again with one") from error
         raise ValueError(f"{path}:{begin + 2}: expected the lines 'Frames: N' and 'Frame Time: SECONDS'") from error
     if not 0 < seconds < 10 or frames < 1:
         raise ValueError(f"{path}:{begin + 2}: {frames} frames of {seconds:g} s; expected at least one of 0 to 10 s")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_number
-from magnet.files import load_npz, save_npz
+from magnet.files import load_npz, npz_path, save_npz
 
 BODY_JOINTS = 22
 """The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
@@ -146,8 +146,7 @@ class Scene:
 
     def repeat(self, samples: int) -> Scene:
         """Each scene `samples` times in a row: scene b becomes b * samples ... b * samples + samples - 1."""
-        index = torch.arange(self.scenes, device=self.device).repeat_interleave(samples)
-        return self.select(index)
+        return self.select(torch.arange(self.scenes, device=self.device).repeat_interleave(samples))
 
     def permute_agents(self, agents: Tensor) -> Scene:
         """Agents in another order, one for all scenes. agents: (P,) int"""
@@ -162,13 +161,12 @@ class Scene:
     def people(self) -> Scene:
         """Each person present as a scene of its own, (M, T, 1), in the order of scenes and slots; names are dropped."""
         there = self.present
-        return Scene(
+        return self.replace(
             body_rot=self.body_rot.transpose(1, 2)[there].unsqueeze(2),
             T_world_root=self.T_world_root.transpose(1, 2)[there].unsqueeze(2),
             betas=self.betas[there].unsqueeze(1),
             present=there[there].unsqueeze(1),
-            fps=self.fps,
-            body=self.body,
+            names=(),
             valid=None if self.valid is None else self.valid[:, None].expand(-1, self.agents, -1)[there],
             given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
         )
@@ -200,9 +198,8 @@ class Scene:
 
     def transformed(self, T_new_world: Tensor) -> Scene:
         """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
-        moved = T_new_world @ self.T_world_root
         keep = self.present[:, None, :, None, None]
-        return self.replace(T_world_root=torch.where(keep, moved, self.T_world_root))
+        return self.replace(T_world_root=torch.where(keep, T_new_world @ self.T_world_root, self.T_world_root))
 
     def with_poses(self, where: Tensor, body_rot: Tensor, T_world_root: Tensor) -> Scene:
         """The same with other poses in some places. where: (B, T, P) bool, or what broadcasts to it"""
@@ -213,9 +210,12 @@ class Scene:
         )
 
     def save(self, path: str | Path) -> Path:
-        """Write all B scenes to one npz that needs no unpickling. Returns the path written."""
-        path = Path(path)
-        path = path if path.suffix.lower() == ".npz" else path.with_name(path.name + ".npz")
+        """Write all B scenes to one npz that needs no unpickling, whose suffix may be left out. Returns its path.
+
+        Raises:
+            ValueError: another suffix, whose format a `Scene` cannot write; says what can.
+        """
+        path = npz_path(path, "Motion.of(scene).save(path) or `magnet export` write other formats")
         path.parent.mkdir(parents=True, exist_ok=True)
         meta = {"format": SCENE_FORMAT, "fps": self.fps, "body": self.body, "names": list(self.names)}
         arrays = {name: value.detach().cpu().numpy() for name, value in self.tensors().items()}

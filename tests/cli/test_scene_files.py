@@ -159,6 +159,30 @@ def test_a_place_that_takes_no_file_is_said_before_anything_is_made(
         assert f"{name}: is a folder" in refused(capsys, *words)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["predict", "--people", "2", "--frames", "900", "--out", "/proc/x/u.npz"],
+        ["agent", "--name", "A", "--scene", "duet.npz", "--listen", "tcp://127.0.0.1:5601", "--out", "/proc/x/u.npz"],
+        ["export-model", "/proc/x.onnx"],
+    ],
+    ids=["predict", "agent", "export-model"],
+)
+def test_a_folder_that_cannot_be_made_is_named_before_the_work(
+    words: list[str], folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
+    said = refused(capsys, *words)
+    assert f"{words[-1]}: /proc" in said and "cannot" in said and "Errno" not in said
+
+
+def test_an_agents_motion_is_an_npz_and_another_suffix_is_refused_before_it_takes_part(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["agent", "--name", "A", "--scene", "duet.npz", "--listen", "tcp://127.0.0.1:5601", "--out", "a.glb"]
+    assert "a.glb: got suffix .glb, expected .npz or none; of it `magnet export` makes" in refused(capsys, *words)
+
+
 def test_a_folder_is_not_called_missing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("dir.npz", "dir.bvh"):
         Path(name).mkdir()

@@ -155,6 +155,9 @@ BREAKS = {
         [*text.split("\n")[:-6], "1 2 3"]
     ),
     "Frames: 2, but 20 frames of 69 numbers": lambda text: text.replace("Frames: 20", "Frames: 2"),
+    "Frame Time: 0,0333333 has a decimal comma, expected a point": lambda text: re.sub(
+        r"Frame Time: \S+", "Frame Time: 0,0333333", text
+    ),
     "expected the lines 'Frames: N'": lambda text: text.replace("Frames: 20", "Frames: many"),
     "frame 20 holds NaN or infinity; leave such frames out in all": lambda text: re.sub(r"\S+\n$", "nan\n", text),
     "something that is no number": lambda text: re.sub(r"\S+\n$", "1.2.3\n", text),

@@ -11,12 +11,13 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 
-from magnet import cli
+import magnet
+from magnet import checkpoints, cli
 from magnet.body import Body, load_body, on_floor
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import formats, resampled, save_smplx
 from magnet.export.rig import UP
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_agents
 from magnet.testing import random_scene
 
 
@@ -272,3 +273,74 @@ def test_a_new_format_is_a_function_and_a_line(duet, tmp_path, body, monkeypatch
     assert len((tmp_path / "b.way").read_text().split()) == duet.agents
     with pytest.raises(ValueError, match=r"use .*\.way"):
         formats.write(duet, tmp_path / "a.obj", body)
+
+
+def couple(kind: str, folder: Path) -> list[Path]:
+    """Two people who stand, in metres, y up, as files of people."""
+    scene = Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 16)
+    return formats.write(scene, folder / f"take{kind}", smplx=kind == ".npz", each=kind == ".npz")
+
+
+WRONG = {
+    "up z": ({"up": "z"}, r"up z, as said, leaves nobody upright; the files look like y up: --up=y"),
+    "up -y": ({"up": "-y"}, r"up -y, as said, leaves nobody upright; the files look like y up"),
+    "unit cm": ({"unit": "cm"}, r"unit cm, as said, .* m .*; the files look like m: --in_unit m"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("kind", [".bvh", ".npz"])
+def test_an_axis_or_unit_that_nobody_can_have_is_warned_of(kind: str, wrong: str, tmp_path: Path) -> None:
+    options, said = WRONG[wrong]
+    with pytest.warns(UserWarning, match=said) as caught:
+        magnet.read(*couple(kind, tmp_path), **options)
+    assert len([one for one in caught if "as said" in str(one.message)]) == 1
+
+
+@pytest.mark.parametrize("options", [{}, {"up": "y"}, {"unit": "m"}], ids=str)
+@pytest.mark.parametrize("kind", [".bvh", ".npz"])
+def test_an_axis_and_unit_that_fit_are_not_warned_of(kind: str, options: dict, tmp_path: Path) -> None:
+    assert not formats.warned(magnet.read(*couple(kind, tmp_path), **options).notes)
+
+
+def test_whoever_really_lies_is_read_with_the_axis_that_is_said(tmp_path: Path) -> None:
+    one = Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz").slice(0, 16).people().select([0])
+    T_lying = torch.eye(4)
+    T_lying[:3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    lies = on_floor(one.transformed(T_lying))
+    read = magnet.read(*formats.write(lies, tmp_path / "lies.bvh"), up="y")
+    assert torch.allclose(read.T_world_root, lies.T_world_root, atol=1e-4) and not formats.warned(read.notes)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".csv", ".usdc", ".usd", ".html"])
+def test_what_is_only_written_is_said_to_be_so(suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"expected .npz or .bvh files, all of one kind; {suffix} can be written but"):
+        formats.read(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".bvh", ".csv", ".glb", ".html"])
+def test_a_scene_without_frames_is_not_written(suffix: str, duet: Scene, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="0 frames of 2 people: there is nothing to write"):
+        formats.write(duet.slice(0, 0), tmp_path / f"a{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [{}, {"smplx": True, "each": True}], ids=["bvh", "npz"])
+def test_files_of_more_people_from_before_are_named_and_stay(options: dict, duet: Scene, tmp_path: Path) -> None:
+    kind = ".npz" if options else ".bvh"
+    four = magnet.Motion.of(cat_agents([duet, duet]))
+    four.save(tmp_path / f"st{kind}", **options)
+    said = f"^st_2{kind}, st_3{kind}: lie beside what was written and are no part of it"
+    with pytest.warns(UserWarning, match=said):
+        magnet.Motion.of(duet).save(tmp_path / f"st{kind}", **options)
+    assert len(list(tmp_path.iterdir())) == 4
+    assert not formats.left_over([tmp_path / f"st_{p}{kind}" for p in range(4)])
+    assert not formats.left_over([tmp_path / f"st_1{kind}"])  # a person alone, who is called so
+
+
+def test_commands_name_files_of_more_people_from_before(
+    duet: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    formats.write(cat_agents([duet, duet]), tmp_path / "st.bvh")
+    assert cli.main(["export", str(duet.save(tmp_path / "duet")), str(tmp_path / "st.bvh")]) == 0
+    assert "st_2.bvh, st_3.bvh: lie beside" in capsys.readouterr().out

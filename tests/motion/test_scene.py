@@ -9,6 +9,9 @@ from magnet.testing import random_scene
 def test_saved_and_loaded_scenes_are_equal(scene: Scene, tmp_path):
     scene = scene.replace(names=("a", "b"), valid=torch.ones(2, 64, dtype=torch.bool))
     loaded = Scene.load(scene.save(tmp_path / "two"))
+    with pytest.raises(ValueError, match=r"two\.glb: got suffix \.glb, expected \.npz or none; Motion\.of"):
+        scene.save(tmp_path / "two.glb")
+    assert [path.name for path in tmp_path.iterdir()] == ["two.npz"]
     for name, value in scene.tensors().items():
         assert torch.equal(value, getattr(loaded, name))
     assert (loaded.fps, loaded.body, loaded.names) == (scene.fps, scene.body, scene.names)

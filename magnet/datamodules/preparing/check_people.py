@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.body.base import MOST_SHAPE
 from magnet.body.joints import ANKLES, HEAD, JOINT_NAMES
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.runs import true_runs
@@ -20,8 +21,6 @@ from magnet.motion.runs import true_runs
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-SHAPE = 12.0
-"""Standard deviations that no shape number is off the mean; fits of real people stay below 6."""
 STATURE = (0.6, 2.1)
 """Metres from ankles to head joint at rest."""
 WILD_ANGLE, WILD_PLACE = 100.0, 1e6
@@ -76,11 +75,11 @@ def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
         DataError: one is too far from the mean.
     """
     size = np.abs(betas).max(axis=1)
-    if wrong := np.flatnonzero(~(size <= SHAPE)).tolist():
+    if wrong := np.flatnonzero(~(size <= MOST_SHAPE)).tolist():
         listed = "; ".join(f"{who(p, names)}: {', '.join(f'{b:.3g}' for b in betas[p])}" for p in wrong)
         raise DataError(
-            f"betas up to {size[wrong].max():.3g}, expected at most {SHAPE:g}, which are standard deviations from the "
-            f"mean shape: nobody has such a body ({listed}); {AGAIN}"
+            f"betas up to {size[wrong].max():.3g}, expected at most {MOST_SHAPE:g}, which are standard deviations from "
+            f"the mean shape: nobody has such a body ({listed}); {AGAIN}"
         )
 
 
