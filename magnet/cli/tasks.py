@@ -14,7 +14,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.cli.flags import taken_out
-from magnet.plugins import Registered
+from magnet.plugins import Registered, told
 from magnet.tasks import Task, registry
 from magnet.version import __version__
 
@@ -163,7 +163,7 @@ def draw_tasks(console: Console) -> bool:
         console.print()
     for name, error in registry.failures().items():
         console.print(Text.assemble((name, "bold red"), "  failed to load"))
-        console.print(Padding(Text(f"{type(error).__name__}: {error}", "red"), (0, 0, 1, 4), expand=False))
+        console.print(Padding(Text(told(error), "red"), (0, 0, 1, 4), expand=False))
     console.print("magnet tasks show NAME      draw in what order a task removes noise", style="dim")
     console.print("magnet test --task NAME     sample it and measure; magnet predict --task NAME", style="dim")
     return not registry.failures()

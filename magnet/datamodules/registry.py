@@ -13,7 +13,7 @@ from typing import TypeVar
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Reader
-from magnet.plugins import Registered, Registry, look_here
+from magnet.plugins import Registered, Registry, attempted, look_here, told
 
 BUILT_IN = (
     "synthetic",
@@ -138,7 +138,7 @@ def default_path() -> str:
     return f"{data.__module__}.{data.__name__}"
 
 
-def failures() -> dict[str, Exception]:
+def failures() -> dict[str, BaseException]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
     return dict(DATA.failed)
@@ -193,10 +193,9 @@ def import_local(path: str) -> None:
         return
     if not look_here(module):
         raise ValueError(f"{path}: no module {top}, neither installed nor in the working directory {Path.cwd()}")
-    try:
-        kind = importlib.import_module(module)
-    except Exception as error:  # a stranger's import may raise anything
-        raise ValueError(f"{path}: {module} cannot be imported: {type(error).__name__}: {error}") from error
+    if (error := attempted(lambda: importlib.import_module(module))) is not None:
+        raise ValueError(f"{path}: {module} cannot be imported: {told(error)}") from error
+    kind = sys.modules[module]
     if not hasattr(kind, name):
         has = [key for key, value in vars(kind).items() if _is_data(value) and value.__module__ == module]
         file = os.path.relpath(kind.__file__) if kind.__file__ else module

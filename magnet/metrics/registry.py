@@ -12,7 +12,7 @@ from torchmetrics import Metric
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.columns import columns_of
 from magnet.metrics.memorisation import NearestTraining
-from magnet.plugins import Registry
+from magnet.plugins import Registry, attempted, told
 
 MEMORISATION = "memorisation"
 """Name of the metric NearestTraining, which needs a training set and so is measured apart from the others."""
@@ -57,14 +57,22 @@ def other_metrics(
         TAKEN.update(known, columns_of(*known.values()), [MEMORISATION], NearestTraining.columns)
         METRICS.discover()
         for name, error in METRICS.failed.items():
-            warnings.warn(f"metric {name} is left out, it failed to load: {error}", stacklevel=2)
+            _warn(name, METRICS.failed_of[name], "failed to load", error)
     made: dict[str, Metric] = {}
     for name, each in sorted(METRICS.known.items()):
-        means: dict[str, Any] = {"confidence": confidence} if issubclass(each.kind, ClipMeans) else {}
-        try:
-            made[name] = each.kind(of=of, agents=agents, fps=fps, **means)
-        except Exception as error:  # a stranger's class may raise anything
-            METRICS.failed[name] = error
+        words: dict[str, Any] = {"of": of, "agents": agents, "fps": fps}
+        if issubclass(each.kind, ClipMeans):
+            words["confidence"] = confidence
+
+        def make(name: str = name, kind: type = each.kind, words: dict[str, Any] = words) -> None:
+            made[name] = kind(**words)
+
+        if (failed := attempted(make)) is not None:
+            METRICS.fail(name, failed, each.origin)
             del METRICS.known[name]
-            warnings.warn(f"metric {name} is left out, it cannot be made: {error}", stacklevel=2)
+            _warn(name, each.origin, "cannot be made", failed)
     return made
+
+
+def _warn(name: str, origin: str, what: str, error: BaseException) -> None:
+    warnings.warn(f"metric {name} is left out, it {what}: {told(error)} (of {origin})", stacklevel=3)
