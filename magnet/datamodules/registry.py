@@ -8,11 +8,11 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 from lightning.pytorch import LightningDataModule
 
-from magnet.datamodules.reading.recording import Reader
+from magnet.datamodules.reading.recording import Family, Reader
 from magnet.plugins import Registered, Registry, attempted, look_here, told
 
 BUILT_IN = (
@@ -52,9 +52,27 @@ def _check(name: str, data: type) -> None:
 def _check_reader(kind: type) -> None:
     if not (isinstance(kind, type) and issubclass(kind, Reader)):
         raise TypeError(f"{kind!r} is no Reader; see docs/own.md")
+    if wrong := _wrong_parts(kind):
+        raise TypeError(f"reader {kind.__module__}.{kind.__qualname__} {' and '.join(wrong)}; see docs/own.md")
     for known in _known_readers():
         if known.name == kind.name and known is not kind:
             raise ValueError(f"reader name {kind.name} is taken by {known.__module__}.{known.__qualname__}")
+
+
+def _wrong_parts(kind: type[Reader]) -> list[str]:
+    """What a reader lacks that the list of data sets shows, or that preparing calls."""
+    texts = {name: getattr(kind, name, None) for name in ("name", "title", "source", "licence")}
+    wrong = [f"has no {name}" for name, text in texts.items() if not (isinstance(text, str) and text)]
+    wrong += [f"has no {method}()" for method in sorted(kind.__abstractmethods__)]
+    if kind.family not in get_args(Family):
+        wrong.append(f"has the family {kind.family!r}, expected {' or '.join(get_args(Family))}")
+    if not (isinstance(kind.layout, tuple | list) and all(_is_place(place) for place in kind.layout)):
+        wrong.append(f"has the layout {kind.layout!r}, expected pairs such as ((PATTERN, WHAT IT IS),)")
+    return wrong
+
+
+def _is_place(value: object) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(part, str) for part in value)
 
 
 DATA = Registry("data set", "magnet.datamodules", [f"magnet.datamodules.{module}" for module in BUILT_IN], _check)
@@ -66,7 +84,7 @@ def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D
     """Class decorator that registers a LightningDataModule by its name, and its `reader` if it has one.
 
     Raises:
-        TypeError: no LightningDataModule.
+        TypeError: no LightningDataModule, or its reader lacks a part.
         ValueError: the name is taken by another class.
     """
 
@@ -83,7 +101,7 @@ def register_reader(kind: R) -> R:
     """Class decorator that registers a reader of downloads for `magnet data` by its `name`.
 
     Raises:
-        TypeError: no Reader.
+        TypeError: no Reader, or one that lacks a part; names it.
         ValueError: the name is taken by another class.
     """
     _check_reader(kind)

@@ -15,6 +15,7 @@ import yaml
 from magnet import cli, plugins
 from magnet.datamodules import Synthetic, registry
 from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.preparing.check import recognise
 from magnet.datamodules.reading.recording import Reader, Recording, Take
 from magnet.denoiser.module import Denoiser
 
@@ -113,6 +114,57 @@ def test_packages_are_listed_and_one_that_fails_hides_no_other(offered: list[Poi
     )
     with pytest.raises(ValueError, match="data set Broken failed to load: ImportError"):
         registry.reader("Broken")
+
+
+def walks(**parts: Any) -> type[Prepared]:
+    """A data set called Walks whose reader has other parts, or lacks those that are None."""
+    given: dict[str, Any] = {
+        "name": "walks",
+        "title": "Walks of theirs",
+        "source": "https://example.org",
+        "licence": "free",
+        "found": lambda self: [],
+        "read": lambda self, take: None,
+        "__module__": "theirs",
+    }
+    whole = {name: part for name, part in (given | parts).items() if part is not None}
+    return type("Walks", (Prepared,), {"reader": type("WalksReader", (Reader,), whole)})
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ({"name": None}, "has no name"),
+        ({"title": None, "licence": ""}, "has no title and has no licence"),
+        ({"source": 3}, "has no source"),
+        ({"read": None}, "has no read()"),
+        ({"found": None, "read": None}, "has no found() and has no read()"),
+        ({"family": "smplh"}, "has the family 'smplh', expected smplx or smpl or positions or any"),
+        ({"layout": ("NAME.npz",)}, "has the layout ('NAME.npz',), expected pairs such as"),
+        ({"layout": "NAME.npz"}, "has the layout 'NAME.npz', expected pairs such as"),
+    ],
+)
+def test_a_reader_that_lacks_a_part_is_refused_and_named_and_in_nobodys_way(
+    parts: dict[str, Any], said: str, offered: list[Point], capsys, tmp_path: Path
+) -> None:
+    offered.append(Point("Walks", "theirs:Walks", walks(**parts)))
+    registry.discover(again=True)
+    assert cli.main(["data", "list"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "failed to load" in line)
+    assert f"TypeError: reader theirs.WalksReader {said}" in line and "docs/own.md" in line
+    (tmp_path / "nothing").mkdir()
+    assert cli.main(["data", "check", str(tmp_path / "nothing")]) == 2
+    assert "neither a prepared store nor a download that is known" in capsys.readouterr().err
+
+
+def test_a_reader_that_fails_on_a_folder_hides_no_other(offered: list[Point], capsys, tmp_path: Path) -> None:
+    def found(self: Reader) -> list[Take]:
+        raise KeyError("theirs")
+
+    offered.append(Point("Walks", "theirs:Walks", walks(found=found)))
+    registry.discover(again=True)
+    registry.reader("dd100").write_fake(tmp_path, 3, 60)
+    assert recognise(tmp_path) == "dd100"
 
 
 def printed(capsys, *words: str) -> dict[str, Any]:
