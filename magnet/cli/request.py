@@ -62,6 +62,11 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     """
     given = Arguments.split(arguments)
     checkpoint_config.import_named(given)
+    if doubtful := registry.doubtful():
+        given.flags = class_options.spelt_out_flags(given.flags, doubtful)
+        for each in given.layers:
+            if "data" in each.options:
+                each.options["data"] = class_options.spelt_out(each.options["data"], doubtful)
     words = given.without("ckpt_path")
     fields, words = split_flags(words) if command in SAMPLING else ([], words)
     name, out = run_name(command, given.files), given.value("out")

@@ -150,6 +150,21 @@ def classes() -> dict[str, type[LightningDataModule]]:
     return {entry.name: entry.kind for entry in entries()}
 
 
+def doubtful() -> dict[str, str]:
+    """Dotted paths of data sets whose short name another class has, too, such as one that was refused for it.
+
+    A refused class is imported all the same, and a parser that looks through subclasses finds both.
+    """
+    found: list[type] = [LightningDataModule]
+    for kind in found:
+        found.extend(kind.__subclasses__())
+    return {
+        name: f"{kind.__module__}.{kind.__qualname__}"
+        for name, kind in classes().items()
+        if any(other.__name__ == name and other is not kind for other in found)
+    }
+
+
 def default_path() -> str:
     """Dotted path of the data set that is taken where none is named."""
     data = next(iter(classes().values()))

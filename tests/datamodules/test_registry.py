@@ -190,6 +190,38 @@ def test_a_file_may_name_it_too_also_within_a_mixture(here: Path, capsys) -> Non
     assert found[0] == {"class_path": "mine_of_mine.sets.Mine", "init_args": {"takes": 3, "max_agents": 2}}
 
 
+OURS = "magnet.datamodules.synthetic.Synthetic"
+MIXTURE = {"class_path": "Mixed", "init_args": {"data": [{"class_path": "Synthetic"}]}}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--data", "Synthetic"], OURS),
+        (["--data=Synthetic", "--data.clip_frames", "70"], OURS),
+        (["--data.class_path", "Synthetic"], OURS),
+        (["--data", yaml.safe_dump({"class_path": "Synthetic"}, default_flow_style=True).strip()], OURS),
+        (["--data", "Mixed", "--data.data", "[Synthetic]"], ["magnet.datamodules.Mixed", OURS]),
+        (["--config", "one.yaml"], OURS),
+        (["--config", "mixed.yaml"], ["magnet.datamodules.Mixed", OURS]),
+        (["--config", "one.yaml", "--data", "mine_of_mine.Synthetic"], "mine_of_mine.Synthetic"),
+    ],
+)
+def test_a_short_name_is_the_registered_class_whatever_a_refused_one_is_called(
+    words: list[str], said: str | list[str], offered: list[Point], here: Path, capsys
+) -> None:
+    (here / "mine_of_mine.py").write_text(MINE.replace("Mine(", "Synthetic("))
+    (here / "one.yaml").write_text(yaml.safe_dump({"data": "Synthetic"}))
+    (here / "mixed.yaml").write_text(yaml.safe_dump({"data": MIXTURE}))
+    registry.import_local("mine_of_mine.Synthetic")
+    offered.append(Point("Synthetic", "mine_of_mine:Synthetic", sys.modules["mine_of_mine"].Synthetic))
+    registry.discover(again=True)
+    assert "name Synthetic is taken" in str(registry.failures()["Synthetic"])
+    got = printed(capsys, *words)
+    paths = [got["class_path"], *(part["class_path"] for part in got["init_args"].get("data", []))]
+    assert paths == ([said] if isinstance(said, str) else said)
+
+
 def test_nothing_of_the_working_directory_takes_the_place_of_a_package(here: Path, capsys) -> None:
     (here / "yaml.py").write_text("raise RuntimeError('not this one')")
     (here / "mine_of_mine.py").write_text(f"import yaml\nyaml.safe_load\n{MINE}")
