@@ -30,7 +30,7 @@ from magnet.sampling.grid import planning_grid
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 
 
 def in_slots(scene: Scene, slots: int) -> Scene:
@@ -83,7 +83,9 @@ def planned(
 ) -> MaskSchedule:
     """A task's plan for scenes of so many frames and people."""
     tokens = -(-(context + horizon) // TOKEN_FRAMES)
-    return task.schedule(planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions()))
+    return schedule_of(
+        task, planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions())
+    )
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,11 @@ def get(name: str) -> type:
     raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(TASKS.known))}.")
 
 
+def name_of(kind: type) -> str:
+    """The name of a task's class; that of the class itself where it is not registered."""
+    return next((entry.name for entry in TASKS.known.values() if entry.kind is kind), kind.__name__)
+
+
 def failures() -> dict[str, BaseException]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
