@@ -201,7 +201,8 @@ def reader(name: str) -> type[Reader]:
     DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
-    raise ValueError(f"no data set {name!r}; {hint}")
+    failed = f" ({', '.join(DATA.failed)} failed to load: magnet data list says why)" if DATA.failed else ""
+    raise ValueError(f"no data set {name!r}; {hint}{failed}")
 
 
 def data_of(kind: type[Reader]) -> str:

@@ -190,6 +190,38 @@ def test_a_file_may_name_it_too_also_within_a_mixture(here: Path, capsys) -> Non
     assert found[0] == {"class_path": "mine_of_mine.sets.Mine", "init_args": {"takes": 3, "max_agents": 2}}
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Broken", "magnet: error: data set Broken failed to load: ImportError: no module named shoes\n"),
+        ("Nowhere", "magnet: error: no data Nowhere; there are Synthetic, "),
+    ],
+)
+@pytest.mark.parametrize("named_by", ["flag", "file"])
+def test_a_data_set_that_is_not_there_is_told_with_the_reason_and_nothing_before_it(
+    name: str, said: str, named_by: str, offered: list[Point], here: Path, capsys
+) -> None:
+    offered.append(Point("Broken", "theirs:Broken", ImportError("no module named shoes")))
+    registry.discover(again=True)
+    (here / "ours.yaml").write_text(yaml.safe_dump({"data": {"class_path": "Synthetic", "init_args": {"seed": 3}}}))
+    (here / "theirs.yaml").write_text(yaml.safe_dump({"data": name}))
+    words = ["--data", name] if named_by == "flag" else ["--config", "theirs.yaml"]
+    assert cli.main(["fit", "--model", "Tokenizer", "--config", "ours.yaml", *words]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(said) and told.count("\n") == 1
+
+
+def test_preparing_says_why_a_reader_is_not_there(offered: list[Point], capsys) -> None:
+    offered.append(Point("Walks", "theirs:Walks", walks(title=None)))
+    registry.discover(again=True)
+    for name, said in {
+        "walks": "data set Walks failed to load: TypeError: reader theirs.WalksReader has no title",
+        "strolling": "(Walks failed to load: magnet data list says why)",
+    }.items():
+        assert cli.main(["data", "prepare", name, "--root", ".", "--out", "store"]) == 2
+        assert said in capsys.readouterr().err
+
+
 OURS = "magnet.datamodules.synthetic.Synthetic"
 MIXTURE = {"class_path": "Mixed", "init_args": {"data": [{"class_path": "Synthetic"}]}}
 
