@@ -173,7 +173,8 @@ class ClipMeans(MotionMetric):
         Raises:
             TypeError: it is no list of pairs of tensors, one pair a name, of one number a clip.
         """
-        measured, expected = self.measure(futures), (len(futures.truth),)
+        measured: Any = self.measure(futures)
+        expected = (len(futures.truth),)
         pairs = list(measured) if isinstance(measured, list | tuple) else [measured]
         fine = all(
             isinstance(pair, list | tuple)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable
 from functools import cache
+from types import new_class
 from typing import Any
 
 import torch
@@ -45,10 +46,9 @@ class Guarded(MotionMetric):
         self.failures = self.failures + 1
 
     def compute(self) -> dict[str, Tensor]:
+        compute: Callable[[], Any] = super().compute  # type: ignore[safe-super]  # the stranger's
         numbers: dict[str, Tensor] = {}
-        self.lost = bool(self.failures) or not self._well(
-            lambda: numbers.update(_scalars(super(Guarded, self).compute(), self.taken))
-        )
+        self.lost = bool(self.failures) or not self._well(lambda: numbers.update(_scalars(compute(), self.taken)))
         return {} if self.lost else numbers
 
     def _well(self, call: Callable[[], object]) -> bool:
@@ -66,8 +66,7 @@ class Guarded(MotionMetric):
 @cache
 def guarded(kind: type[MotionMetric]) -> type[Guarded]:
     """The class with a guard before it, under its own name."""
-    made: type[Guarded] = type(kind)(kind.__name__, (Guarded, kind), {"__module__": kind.__module__})
-    return made
+    return new_class(kind.__name__, (Guarded, kind), {}, lambda names: names.update(__module__=kind.__module__))
 
 
 def _blank(kind: type[MotionMetric]) -> Guarded:
