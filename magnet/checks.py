@@ -53,7 +53,8 @@ def require_choice(name: str, value: object, choices: object) -> None:
         ValueError: names the field, what was got and what there is.
     """
     if value not in get_args(choices):
-        raise ValueError(f"{name}: got {value!r}, expected {' or '.join(get_args(choices))}")
+        words = " or ".join(word or '""' for word in get_args(choices))
+        raise ValueError(f"{name}: got {value!r}, expected {words}")
 
 
 def require_flag(name: str, value: object, unsaid: bool = False) -> None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from magnet.errors import Stopped
+
 
 @dataclass(frozen=True)
 class Registered:
@@ -39,7 +41,8 @@ class Registry:
     def __init__(self, what: str, group: str, modules: Sequence[str], check: Callable[[str, type], None]) -> None:
         self.what, self.group, self.modules, self.check = what, group, modules, check
         self.known: dict[str, Registered] = {}
-        self.failed: dict[str, Exception] = {}
+        self.failed: dict[str, BaseException] = {}
+        self.failed_of: dict[str, str] = {}  # where each of them comes from
         self.discovered = False
 
     def add(self, name: str, kind: type, origin: str) -> None:
@@ -61,6 +64,7 @@ class Registry:
             return False
         self.discovered = True
         self.failed.clear()
+        self.failed_of.clear()
         for module in self.modules:
             importlib.import_module(module)
         for point in entry_points(group=self.group):
@@ -69,23 +73,50 @@ class Registry:
 
     def load(self, name: str, load: Callable[[], type], origin: str) -> None:
         """Load a plug-in. Its class may have registered itself with a decorator, which does not know the origin."""
-        try:
+
+        def loaded() -> None:
             kind = load()
             self.check(name, kind)
             own = [entry.name for entry in self.known.values() if entry.kind is kind]
             for each in own or [name]:
                 self.add(each, kind, origin)
-        except Exception as error:  # a stranger's import may raise anything
-            self.failed[name] = error
+
+        if (error := attempted(loaded)) is not None:
+            self.fail(name, error, origin)
+
+    def fail(self, name: str, error: BaseException, origin: str) -> None:
+        """Note why a plug-in is not there, and which package brings it."""
+        self.failed[name], self.failed_of[name] = error, origin
 
     def require_loaded(self, name: str) -> None:
         """Say why a plug-in is not there.
 
         Raises:
-            ValueError: a plug-in of that name failed to load.
+            ValueError: a plug-in of that name, in letters of any case, failed to load.
         """
-        if name in self.failed:
-            raise ValueError(f"{self.what} {name} failed to load: {self.failed[name]!r}") from self.failed[name]
+        for each, error in self.failed.items():
+            if each.lower() == name.lower():
+                raise ValueError(f"{self.what} {each} failed to load: {told(error)}") from error
+
+
+def attempted(call: Callable[[], object]) -> BaseException | None:
+    """Run a stranger's code, which may raise anything, even SystemExit. -> what it raised
+
+    Only what stops the whole process goes on: an interrupt, or the signal that ends a command.
+    """
+    try:
+        call()
+    except (KeyboardInterrupt, Stopped):
+        raise
+    except BaseException as error:
+        return error
+    return None
+
+
+def told(error: BaseException) -> str:
+    """An error's kind and text in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def look_here(module: str) -> bool:

@@ -21,6 +21,7 @@ ELSEWHERE = {
     "from magnet.datamodules.cmu import CMU": "needs CMU's recordings",
     "# magnet_duel/__init__.py": "tests/tasks/test_example.py",
     "# tests/test_duel.py": "tests/tasks/test_example.py",
+    "# magnet_duel/waltzes.py": "tests/datamodules/test_example.py",
     "import json, math, struct": "tests/agents/test_processes.py",
 }
 """How blocks begin that run in another test, or need what is not here."""

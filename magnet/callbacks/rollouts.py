@@ -24,7 +24,7 @@ from magnet.sampling.grid import Grid
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive
 from magnet.tasks import registry
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 from magnet.tasks.joint import JointFuture
 
 COMPARED = 16
@@ -89,7 +89,7 @@ class RollOuts(Callback):
             raise ValueError("tasks: got none, expected at least one")
         self.names, self.tasks = tuple(tasks), [registry.get(task)() for task in tasks]
         for name, task in zip(tasks, self.tasks, strict=True):
-            plan = task.schedule(GOING_ON)
+            plan = schedule_of(task, GOING_ON)
             if not bool(plan.known[GOING_ON.past()].all()) or not bool(plan.finished.all()):
                 raise ValueError(f"tasks: got {name}, expected tasks that go on from a past and leave nobody unknown")
         self.kept: list[Scene] = []
@@ -184,7 +184,7 @@ class RollOuts(Callback):
 
 def reads_ahead(task: Task) -> bool:
     """Whether a task reads what comes after the past: of somebody who is given, or at keyframes."""
-    return not torch.equal(task.schedule(GOING_ON).known, GOING_ON.past())
+    return not torch.equal(schedule_of(task, GOING_ON).known, GOING_ON.past())
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:

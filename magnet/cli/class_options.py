@@ -9,10 +9,16 @@ the parser without what they say of others.
 from __future__ import annotations
 
 import copy
+import json
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
+
+import yaml
 
 from magnet.cli.config_files import Layer
 from magnet.cli.flags import Options, class_in_flags, spec_of, valued
@@ -64,6 +70,44 @@ def one_class(flags: Sequence[str]) -> list[str]:
         for i in reversed(places[:-1]):
             del kept[i : i + (1 if "=" in kept[i] else 2)]
     return kept
+
+
+def spelt_out(value: Any, paths: Mapping[str, str], named: bool = True) -> Any:
+    """What stands under `data`, with short names that several classes have as dotted paths.
+
+    Args:
+        value: a name, or a class with its options, or a list of these.
+        paths: dotted paths by short name.
+        named: whether a text that stands here is a class's name.
+    """
+    if isinstance(value, dict):
+        return {key: spelt_out(part, paths, key in ("class_path", "data")) for key, part in value.items()}
+    if isinstance(value, list):
+        return [spelt_out(part, paths, named) for part in value]
+    return paths.get(value, value) if named and isinstance(value, str) else value
+
+
+def spelt_out_flags(flags: Sequence[str], paths: Mapping[str, str]) -> list[str]:
+    """The same for `--data NAME`, `--data.class_path NAME` and mappings and lists on the command line."""
+
+    def text(name: str, value: str) -> str:
+        leaf = name.rpartition(".")[2].rstrip("+")
+        if not re.match(r"--data[.=+]|--data$", name) or leaf not in ("--data", "data", "class_path"):
+            return value
+        if value[:1] not in ("{", "["):
+            return str(spelt_out(value, paths))
+        with suppress(yaml.YAMLError):  # the parser says what is wrong with it
+            return json.dumps(spelt_out(yaml.safe_load(value), paths))
+        return value
+
+    found: list[str] = []
+    for before, word in pairwise(["", *flags]):
+        name, equals, value = word.partition("=")
+        if word.startswith("--"):
+            found.append(f"{name}={text(name, value)}" if equals else word)
+        else:
+            found.append(text(before, word) if "=" not in before else word)
+    return found
 
 
 def same_class(one: str, other: str) -> bool:

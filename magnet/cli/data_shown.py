@@ -37,6 +37,7 @@ def run_list(given: argparse.Namespace) -> int:
 def draw_list(console: Console, name: str | None) -> bool:
     """Print all data sets, or one in full. -> whether the same call will print the same again"""
     from magnet.datamodules import registry
+    from magnet.plugins import told
 
     if name:
         for entry in registry.unprepared():
@@ -51,7 +52,7 @@ def draw_list(console: Console, name: str | None) -> bool:
         show_data(console, entry)
     for plugin, error in registry.failures().items():
         console.print(f"[bold red]{plugin}[/]", soft_wrap=True)
-        show(console, "failed to load", f"{type(error).__name__}: {error}")
+        show(console, "failed to load", told(error))
     return not registry.failures()
 
 

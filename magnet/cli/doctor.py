@@ -1,4 +1,4 @@
-"""`magnet doctor`: what is installed and what each extra adds, the devices, and where models and data lie."""
+"""`magnet doctor`: what is installed, what each extra and plug-in adds, devices, and where models and data lie."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import os
 import platform
 import shutil
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from magnet import plugins
 from magnet.cli.flags import PlainParser
 from magnet.version import __version__
 
@@ -62,7 +64,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns 0, or 1 where something is wrong; what is only missing is no fault."""
     parser = PlainParser("doctor", __doc__)
     parser.parse_args(list(arguments))
-    found = [*packages(), *devices(), *extras(), *files()]
+    found = [*packages(), *devices(), *extras(), *others(), *files()]
     wide = max(len(finding.what) for finding in found)
     print(f"magnet {__version__} in {Path(__file__).parents[1]}")
     room = ""
@@ -139,6 +141,44 @@ def extras() -> Iterator[Finding]:
         else:
             there = ", ".join(f"{each} {version}" for each, version in versions.items())
             yield Finding("extras", name, "ok", f"{extra.adds} ({there})")
+
+
+GROUPS = ("magnet.tasks", "magnet.datamodules", "magnet.metrics")
+"""Entry points through which packages add classes."""
+
+
+def others() -> Iterator[Finding]:
+    """What other packages add; nothing is imported where none adds anything."""
+    if version_of("torch") is None:
+        return
+    if not os.environ.get("MAGNET_TASKS") and not any(plugins.entry_points(group=group) for group in GROUPS):
+        return
+    from magnet.datamodules import registry as data
+    from magnet.metrics import all_metrics
+    from magnet.metrics.registry import METRICS
+    from magnet.tasks import registry as tasks
+    from magnet.tasks.base import fault_of
+
+    tasks.discover()
+    data.discover()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the same failures as below
+        all_metrics()
+    for known in (tasks.TASKS, data.DATA, METRICS):
+        for name, entry in sorted(known.known.items()):
+            if entry.origin != "magnet":
+                fault = fault_of(entry.kind) if known is tasks.TASKS else None
+                yield _other(f"{known.what} {name}", entry.origin, fault)
+        for name, error in sorted(known.failed.items()):
+            origin = known.failed_of.get(name, "another package")
+            yield _other(f"{known.what} {name}", origin, f"failed to load: {plugins.told(error)}")
+
+
+def _other(what: str, origin: str, fault: str | None) -> Finding:
+    if fault is None:
+        return Finding("plug-ins", what, "ok", f"of {origin}")
+    advice = f"mend or uninstall {origin}; everything else works without it"
+    return Finding("plug-ins", what, "wrong", f"of {origin}: {fault}", advice)
 
 
 def files() -> Iterator[Finding]:

@@ -13,6 +13,7 @@ from types import FrameType
 
 from magnet.cli import predict_files
 from magnet.cli.errors import CommandError, explain, no_such
+from magnet.errors import Stopped
 from magnet.version import __version__
 
 TRAINER_COMMANDS = {
@@ -96,7 +97,7 @@ def ended_by_sigterm(command: str) -> Iterator[None]:
         return
 
     def end(number: int, _: FrameType | None) -> None:
-        raise SystemExit(128 + number)
+        raise Stopped(128 + number)
 
     before = signal.signal(signal.SIGTERM, end)
     try:

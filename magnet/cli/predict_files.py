@@ -291,6 +291,7 @@ def lengths(
     """
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
+    from magnet.tasks.base import schedule_of
 
     crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)
@@ -299,13 +300,13 @@ def lengths(
     rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
     tokens, steps = -(-(context + rest) // TOKEN_FRAMES), model.sampler.steps
     if added:  # planned with a past, for tasks that need one refuse to be planned without
-        planned = choice.task.schedule(Grid(tokens + 1, scene.agents, max(context // TOKEN_FRAMES, 1), steps)).known
+        planned = schedule_of(choice.task, Grid(tokens + 1, scene.agents, max(context // TOKEN_FRAMES, 1), steps)).known
         if bool(planned[:, list(added)].any()):
             raise CommandError(
                 f"{choice.name} reads motion of person {added[0]}, of whom no file tells; partner_inpainting adds "
                 "people to those that are there, generation makes everybody"
             )
-    known = choice.task.schedule(Grid(tokens, scene.agents, context // TOKEN_FRAMES, steps)).known
+    known = schedule_of(choice.task, Grid(tokens, scene.agents, context // TOKEN_FRAMES, steps)).known
     if bool(known[context // TOKEN_FRAMES :].any()):
         return scene, context, rest if options.frames or recorded > context else FUTURE
     if bool(known.any()):  # of generation nothing is

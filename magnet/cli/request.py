@@ -62,6 +62,11 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     """
     given = Arguments.split(arguments)
     checkpoint_config.import_named(given)
+    if doubtful := registry.doubtful():
+        given.flags = class_options.spelt_out_flags(given.flags, doubtful)
+        for each in given.layers:
+            if "data" in each.options:
+                each.options["data"] = class_options.spelt_out(each.options["data"], doubtful)
     words = given.without("ckpt_path")
     fields, words = split_flags(words) if command in SAMPLING else ([], words)
     name, out = run_name(command, given.files), given.value("out")
@@ -89,6 +94,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
     settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
+    require_data(settled.classes.get("data"))
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
     task = None
@@ -98,6 +104,22 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
     layers = [each.text() for each in settled.layers if each.options]
     return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task)
+
+
+def require_data(name: str | None) -> None:
+    """Refuse the short name of a data set that there is not, before anything else is told of it.
+
+    Raises:
+        CommandError: says why it failed to load where a package offers it, or else what there is.
+    """
+    known = registry.classes()
+    if name is None or name in known or not name.isidentifier():
+        return  # of anything but a short name the parser says what is wrong
+    try:
+        registry.DATA.require_loaded(name)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    raise CommandError(f"no data {name}; there are {', '.join(known)}, or give a dotted path of your own")
 
 
 def run_name(command: str, files: list[str]) -> str:

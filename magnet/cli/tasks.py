@@ -14,8 +14,9 @@ from jsonargparse import ArgumentError, ArgumentParser
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.cli.flags import taken_out
-from magnet.plugins import Registered
+from magnet.plugins import Registered, told
 from magnet.tasks import Task, registry
+from magnet.tasks.base import fault_of, schedule_of
 from magnet.version import __version__
 
 if TYPE_CHECKING:
@@ -150,23 +151,27 @@ def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
 
 
 def draw_tasks(console: Console) -> bool:
-    """All tasks, and the plug-ins that failed to load. -> whether it will be the same the next time"""
+    """All tasks, with what is wrong with one's plan, and the plug-ins that failed to load. -> whether it stays so"""
     from rich.padding import Padding
     from rich.text import Text
 
+    faults = 0
     for entry in registry.entries():
         console.print(Text.assemble((entry.name, "bold cyan"), "  ", (origin(entry), "dim")))
         first = (inspect.getdoc(entry.kind) or "").split("\n\n")[0].replace("\n", " ")
         lines = [(str(getattr(entry.kind, "formula", "")), "magenta"), (first, ""), (options(entry.kind), "green")]
+        if (fault := fault_of(entry.kind)) is not None:
+            faults += 1
+            lines.append((f"cannot be sampled: {fault}", "bold red"))
         for line, style in lines:
             console.print(Padding(Text(line, style), (0, 0, 0, 4), expand=False))
         console.print()
     for name, error in registry.failures().items():
         console.print(Text.assemble((name, "bold red"), "  failed to load"))
-        console.print(Padding(Text(f"{type(error).__name__}: {error}", "red"), (0, 0, 1, 4), expand=False))
+        console.print(Padding(Text(told(error), "red"), (0, 0, 1, 4), expand=False))
     console.print("magnet tasks show NAME      draw in what order a task removes noise", style="dim")
     console.print("magnet test --task NAME     sample it and measure; magnet predict --task NAME", style="dim")
-    return not registry.failures()
+    return not registry.failures() and not faults
 
 
 def origin(entry: Registered) -> str:
@@ -254,7 +259,7 @@ def show_task(arguments: list[str]) -> int:
     task, shown = kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
     grid = Grid(*sizes, noise_sampling=shown.noise_sampling, turn=shown.turn, opening=shown.opening)
-    schedule = task.schedule(grid)
+    schedule = schedule_of(task, grid)
     formula = str(getattr(task, "formula", ""))
     if shown.out is not None:
         path = draw_schedule(schedule, shown.out, title=name, subtitle=formula, count=shown.moments)

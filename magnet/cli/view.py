@@ -186,11 +186,12 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.sampling.grid import Grid
     from magnet.tasks import registry
+    from magnet.tasks.base import schedule_of
 
     task = registry.get(options.task)()
     given = options.context // TOKEN_FRAMES
     try:  # before a model is loaded
-        task.schedule(Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
+        schedule_of(task, Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
     except ValueError as error:
         raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
     model = DenoiserCore.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))

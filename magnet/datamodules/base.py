@@ -19,14 +19,37 @@ from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store.memory import MemoryStore, WindowIndex
 from magnet.datamodules.store.reader import StoreSplit
 from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows, longest_stretch
+from magnet.errors import DataError
 from magnet.motion.scene import Scene
+from magnet.plugins import attempted, told
 from magnet.seeding import derive
 
-__all__ = ["Clip", "EmptySplitError", "MotionDataModule", "Split"]
+__all__ = ["Clip", "EmptySplitError", "MotionDataModule", "Split", "clips_of"]
 
 
 class EmptySplitError(ValueError):
     """A split has no clips; the message names the splits that have some."""
+
+
+def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
+    """What a data set's `clips` gives, of a stranger's as of ours.
+
+    Raises:
+        DataError: it is not there, takes no split, raises what is no ValueError, or gives something else than clips.
+    """
+    name = f"data set {type(data).__module__}.{type(data).__qualname__}"
+    given: list[Any] = []
+    error = attempted(lambda: given.append(data.clips(split)))
+    if isinstance(error, ValueError | OSError | ImportError):
+        raise error  # what is wrong with files, or not installed, is said already
+    if error is not None:
+        raise DataError(f"{name}: clips({split!r}) fails: {told(error)}; see docs/own.md") from error
+    (clips,) = given
+    if not isinstance(clips, list | tuple):
+        raise DataError(f"{name}: clips({split!r}) gave {type(clips).__name__}, expected a list of Clip")
+    if strange := [clip for clip in clips if not isinstance(clip, Clip)]:
+        raise DataError(f"{name}: clips({split!r}) gave {type(strange[0]).__name__} in its list, expected Clip")
+    return list(clips)
 
 
 class MotionDataModule(LightningDataModule):
@@ -128,7 +151,7 @@ class MotionDataModule(LightningDataModule):
         Raises:
             EmptySplitError: the split has no clips.
         """
-        clips = self.clips(split)
+        clips = clips_of(self, split)
         if not clips:
             raise EmptySplitError(
                 f"{type(self).__name__}: split {split} is empty; give it recordings, or leave out what needs it"
@@ -137,7 +160,7 @@ class MotionDataModule(LightningDataModule):
 
     def split_data(self, split: Split) -> StoreSplit | None:
         """The clips of a split as rows to be read by memory map; None: there are none."""
-        clips = self.clips(split)
+        clips = clips_of(self, split)
         return StoreSplit.encoded(clips) if clips else None
 
     def _placed(self, split: Split) -> MemoryStore:

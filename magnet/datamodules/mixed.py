@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.base import Clip, MotionDataModule, Split, clips_of
 from magnet.datamodules.registry import register_data
 from magnet.datamodules.store.mapped import MappedStore
 from magnet.datamodules.store.memory import MemoryStore
@@ -82,7 +82,7 @@ class Mixed(Parts):
 
     def clips(self, split: Split) -> list[Clip]:
         """Clips of all data sets, or of the one chosen for the split."""
-        return [clip for part in self._used(split) for clip in part.clips(split)]
+        return [clip for part in self._used(split) for clip in clips_of(part, split)]
 
     def split_data(self, split: Split) -> StoreSplit | None:
         """Rows of all data sets, or of the one chosen for the split."""

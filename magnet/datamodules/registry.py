@@ -8,12 +8,12 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 from lightning.pytorch import LightningDataModule
 
-from magnet.datamodules.reading.recording import Reader
-from magnet.plugins import Registered, Registry, look_here
+from magnet.datamodules.reading.recording import Family, Reader
+from magnet.plugins import Registered, Registry, attempted, look_here, told
 
 BUILT_IN = (
     "synthetic",
@@ -52,9 +52,27 @@ def _check(name: str, data: type) -> None:
 def _check_reader(kind: type) -> None:
     if not (isinstance(kind, type) and issubclass(kind, Reader)):
         raise TypeError(f"{kind!r} is no Reader; see docs/own.md")
+    if wrong := _wrong_parts(kind):
+        raise TypeError(f"reader {kind.__module__}.{kind.__qualname__} {' and '.join(wrong)}; see docs/own.md")
     for known in _known_readers():
         if known.name == kind.name and known is not kind:
             raise ValueError(f"reader name {kind.name} is taken by {known.__module__}.{known.__qualname__}")
+
+
+def _wrong_parts(kind: type[Reader]) -> list[str]:
+    """What a reader lacks that the list of data sets shows, or that preparing calls."""
+    texts = {name: getattr(kind, name, None) for name in ("name", "title", "source", "licence")}
+    wrong = [f"has no {name}" for name, text in texts.items() if not (isinstance(text, str) and text)]
+    wrong += [f"has no {method}()" for method in sorted(kind.__abstractmethods__)]
+    if kind.family not in get_args(Family):
+        wrong.append(f"has the family {kind.family!r}, expected {' or '.join(get_args(Family))}")
+    if not (isinstance(kind.layout, tuple | list) and all(_is_place(place) for place in kind.layout)):
+        wrong.append(f"has the layout {kind.layout!r}, expected pairs such as ((PATTERN, WHAT IT IS),)")
+    return wrong
+
+
+def _is_place(value: object) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2 and all(isinstance(part, str) for part in value)
 
 
 DATA = Registry("data set", "magnet.datamodules", [f"magnet.datamodules.{module}" for module in BUILT_IN], _check)
@@ -66,7 +84,7 @@ def register_data(origin: str = "magnet", combines: bool = False) -> Callable[[D
     """Class decorator that registers a LightningDataModule by its name, and its `reader` if it has one.
 
     Raises:
-        TypeError: no LightningDataModule.
+        TypeError: no LightningDataModule, or its reader lacks a part.
         ValueError: the name is taken by another class.
     """
 
@@ -83,7 +101,7 @@ def register_reader(kind: R) -> R:
     """Class decorator that registers a reader of downloads for `magnet data` by its `name`.
 
     Raises:
-        TypeError: no Reader.
+        TypeError: no Reader, or one that lacks a part; names it.
         ValueError: the name is taken by another class.
     """
     _check_reader(kind)
@@ -132,13 +150,28 @@ def classes() -> dict[str, type[LightningDataModule]]:
     return {entry.name: entry.kind for entry in entries()}
 
 
+def doubtful() -> dict[str, str]:
+    """Dotted paths of data sets whose short name another class has, too, such as one that was refused for it.
+
+    A refused class is imported all the same, and a parser that looks through subclasses finds both.
+    """
+    found: list[type] = [LightningDataModule]
+    for kind in found:
+        found.extend(kind.__subclasses__())
+    return {
+        name: f"{kind.__module__}.{kind.__qualname__}"
+        for name, kind in classes().items()
+        if any(other.__name__ == name and other is not kind for other in found)
+    }
+
+
 def default_path() -> str:
     """Dotted path of the data set that is taken where none is named."""
     data = next(iter(classes().values()))
     return f"{data.__module__}.{data.__name__}"
 
 
-def failures() -> dict[str, Exception]:
+def failures() -> dict[str, BaseException]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
     return dict(DATA.failed)
@@ -168,7 +201,8 @@ def reader(name: str) -> type[Reader]:
     DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
-    raise ValueError(f"no data set {name!r}; {hint}")
+    failed = f" ({', '.join(DATA.failed)} failed to load: magnet data list says why)" if DATA.failed else ""
+    raise ValueError(f"no data set {name!r}; {hint}{failed}")
 
 
 def data_of(kind: type[Reader]) -> str:
@@ -193,10 +227,9 @@ def import_local(path: str) -> None:
         return
     if not look_here(module):
         raise ValueError(f"{path}: no module {top}, neither installed nor in the working directory {Path.cwd()}")
-    try:
-        kind = importlib.import_module(module)
-    except Exception as error:  # a stranger's import may raise anything
-        raise ValueError(f"{path}: {module} cannot be imported: {type(error).__name__}: {error}") from error
+    if (error := attempted(lambda: importlib.import_module(module))) is not None:
+        raise ValueError(f"{path}: {module} cannot be imported: {told(error)}") from error
+    kind = sys.modules[module]
     if not hasattr(kind, name):
         has = [key for key, value in vars(kind).items() if _is_data(value) and value.__module__ == module]
         file = os.path.relpath(kind.__file__) if kind.__file__ else module

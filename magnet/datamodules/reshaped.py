@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
 from magnet.body.other_shapes import with_shapes
-from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.base import Clip, MotionDataModule, Split, clips_of
 from magnet.datamodules.clip import at_least
 from magnet.datamodules.mixed import Parts
 from magnet.datamodules.preparing.progress import progress_bar
@@ -102,7 +102,7 @@ class Reshaped(Parts):
 
     def _wanted(self) -> list[tuple[Clip, int, Tensor, Path]]:
         """Each clip with the number of its variant, shapes (1, P, 10) and the file where the scene lies or will lie."""
-        clips = [clip for part in self.data for clip in part.clips("train")]
+        clips = [clip for part in self.data for clip in clips_of(part, "train")]
         everybody = torch.cat([clip.scene.betas[clip.scene.present] for clip in clips]) if clips else None
         made = []
         for clip in (clip for clip in clips if clip.agents > 1):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magnet.body.mirror import mirror_scene
 from magnet.checks import require_number
-from magnet.datamodules.base import Clip, MotionDataModule, Split
+from magnet.datamodules.base import Clip, MotionDataModule, Split, clips_of
 from magnet.datamodules.mixed import Parts
 from magnet.datamodules.registry import register_data
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
@@ -89,7 +89,7 @@ class SoloPairs(Parts):
         if split != "train":
             return []
         pairs = []
-        for clip in (clip for part in self.data for clip in part.clips("train") if clip.agents == 1):
+        for clip in (clip for part in self.data for clip in clips_of(part, "train") if clip.agents == 1):
             for name in self.pairings:
                 seed = derive(self.pair_seed, f"{name} {clip.name}")
                 pair = paired(clip.scene, name, self.delay, self.clearance, torch.Generator().manual_seed(seed))

@@ -20,8 +20,9 @@ from magnet.datamodules.base import MotionDataModule
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import occupied
 from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
+from magnet.metrics.guarded import lost_numbers
 from magnet.metrics.interval import Unit, independent_units
-from magnet.metrics.registry import MEMORISATION
+from magnet.metrics.registry import MEMORISATION, stems
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -29,7 +30,7 @@ from magnet.sampling.grid import planning_grid
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 
 
 def in_slots(scene: Scene, slots: int) -> Scene:
@@ -82,7 +83,9 @@ def planned(
 ) -> MaskSchedule:
     """A task's plan for scenes of so many frames and people."""
     tokens = -(-(context + horizon) // TOKEN_FRAMES)
-    return task.schedule(planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions()))
+    return schedule_of(
+        task, planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions())
+    )
 
 
 @dataclass(frozen=True)
@@ -268,6 +271,8 @@ class Scoring:
     def finish(self, facts: dict[str, Any]) -> Results:
         """The table of all methods, with how it came about."""
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
+        lost = lost_numbers(self.metrics.values())
+        rows = {name: {key: row[key] for key in row if not stems(key) & lost} for name, row in rows.items()}
         columns = columns_of(*self.metrics.values())
         strangers: dict[str, tuple[Beside, ...]] = {TRAINING: ("recording", "samples")}  # not of the recorded scene
         if self.nothing_is_given:

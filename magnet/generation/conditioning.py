@@ -14,7 +14,7 @@ from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
 from magnet.sampling.schedule import Grid, MaskSchedule
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 from magnet.tokenizer.carried import Carried
 from magnet.tokenizer.lean import Growing
 
@@ -137,7 +137,7 @@ def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
     A window that ends with its block hides nothing after it. So the task also plans on a grid with a wider window.
     """
     wider = dataclasses.replace(grid, window=2 * grid.window, stride=2 * grid.window, pyramid_offset=0)
-    return torch.minimum(lookahead_limit(task.schedule(grid)), lookahead_limit(task.schedule(wider)))
+    return torch.minimum(lookahead_limit(schedule_of(task, grid)), lookahead_limit(schedule_of(task, wider)))
 
 
 Encoders = dict[tuple[int, ...], Carried]

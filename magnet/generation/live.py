@@ -26,7 +26,7 @@ from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl
@@ -216,7 +216,7 @@ class Live:
             frames = self._length(type(task))
         past = scene.slice(scene.frames - CONTEXT)
         grid = Grid((CONTEXT + frames) // TOKEN_FRAMES, scene.agents, CONTEXT // TOKEN_FRAMES, self.settings.steps)
-        known = task.schedule(grid).known
+        known = schedule_of(task, grid).known
         if not bool(known[: grid.context].all()):
             raise ValueError(
                 f"{self.settings.task} does not go on from everybody's past, so it cannot be played live; "

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 
 
 class PlannedStage(NamedTuple):
@@ -68,7 +68,7 @@ def periodic_plan(task: Task, grid: Grid, slots: int, online: bool = False) -> t
         ValueError: the plan depends on the scene's end or is not periodic, or the task looks ahead at what is fed.
     """
     long, longer = (
-        task.schedule(dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
+        schedule_of(task, dataclasses.replace(grid, tokens=grid.context + windows * grid.window)).padded(slots)
         for windows in (6, 7)
     )
     name = type(task).__name__

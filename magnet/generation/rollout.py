@@ -41,7 +41,7 @@ from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 
 CHUNK, FEW = 64, 8
 """Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk; and that are encoded at a
@@ -171,7 +171,7 @@ class Rollout:
             schedule, self.plan = periodic_plan(task, grid, layout.agents, self.online)
             self.length = torch.inf
         else:
-            schedule = task.schedule(grid).padded(layout.agents)
+            schedule = schedule_of(task, grid).padded(layout.agents)
             self.plan = planned(schedule)
         require_people(schedule, self.scene)
         self.known = schedule.known

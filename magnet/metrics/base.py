@@ -159,13 +159,35 @@ class ClipMeans(MotionMetric):
         """For each name, every clip's total and count. -> K x ((B,), (B,))"""
 
     def add(self, futures: Futures) -> None:
-        shares = [torch.stack(torch.broadcast_tensors(*pair), dim=-1) for pair in self.measure(futures)]
+        shares = [torch.stack(torch.broadcast_tensors(*pair), dim=-1) for pair in self._measured(futures)]
         clips = torch.stack(shares, dim=1).double()
         self.clips.append(clips)
         alone = torch.full((len(clips),), -1, device=clips.device)
         self.units.append(alone if futures.units is None else futures.units.to(alone))
         self.total += clips[..., 0].sum(dim=0)
         self.count += clips[..., 1].sum(dim=0)
+
+    def _measured(self, futures: Futures) -> list[tuple[Tensor, Tensor]]:
+        """What `measure` gave, which may be a stranger's.
+
+        Raises:
+            TypeError: it is no list of pairs of tensors, one pair a name, of one number a clip.
+        """
+        measured: Any = self.measure(futures)
+        expected = (len(futures.truth),)
+        pairs = list(measured) if isinstance(measured, list | tuple) else [measured]
+        fine = all(
+            isinstance(pair, list | tuple)
+            and len(pair) == 2
+            and all(isinstance(sums, Tensor) and sums.shape in (expected, ()) for sums in pair)
+            for pair in pairs
+        )
+        if len(pairs) != len(self.names) or not fine:
+            raise TypeError(
+                f"{type(self).__name__}.measure gave {_shapes(measured)}, expected a list of a pair (total, count) for "
+                f"each of {', '.join(self.names)}, tensors of shape {expected}, as clip_sums makes them"
+            )
+        return pairs
 
     def compute(self) -> dict[str, Tensor]:
         result = {}
@@ -179,6 +201,15 @@ class ClipMeans(MotionMetric):
                 if interval is not None:
                     result |= {f"{name}_low": interval[0], f"{name}_high": interval[1]}
         return result
+
+
+def _shapes(value: Any) -> str:
+    """Tensors by their shapes, whatever holds them."""
+    if isinstance(value, Tensor):
+        return f"a tensor {tuple(value.shape)}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_shapes(part) for part in value)}]"
+    return type(value).__name__
 
 
 def _folded(keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import ddim_levels, ddim_step
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive, step_generator
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
@@ -170,7 +170,7 @@ class Peer(TokenModel):
         """
         tokens = -(-(context + horizon) // TOKEN_FRAMES)
         grid = planning_grid(tokens, 2, context // TOKEN_FRAMES, self.window, SamplerOptions())
-        known = task.schedule(grid).known[:tokens]
+        known = schedule_of(task, grid).known[:tokens]
         self.require(known)
         return known
 

@@ -1,10 +1,20 @@
-"""What a task is: a small record of options that plans a mask schedule."""
+"""What a task is: a small record of options that plans a mask schedule; and how it is asked for its plan."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar, Protocol, runtime_checkable
 
+from magnet.plugins import attempted, told
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.registry import name_of
+
+SMALL = Grid(tokens=14, agents=2, context=4, steps=6, window=8, stride=4)
+"""What a task is tried on, as `magnet tasks show` draws it."""
+
+
+class TaskError(ValueError):
+    """A task's own code fails, or gives something else than a plan."""
 
 
 @runtime_checkable
@@ -24,3 +34,35 @@ class Task(Protocol):
             ValueError: the task makes no sense on this grid (says why).
         """
         ...
+
+
+def schedule_of(task: Task, grid: Grid) -> MaskSchedule:
+    """A task's plan on a grid, of a stranger's task as of ours.
+
+    Raises:
+        ValueError: the task makes no sense on this grid, as it says itself.
+        TaskError: its code raises anything else, or gives no plan; names the task.
+    """
+    given: list[object] = []
+    error = attempted(lambda: given.append(task.schedule(grid)))
+    if isinstance(error, ValueError):
+        raise error
+    name = name_of(type(task))
+    if error is not None:
+        raise TaskError(f"task {name}: schedule(grid) fails: {told(error)}; see docs/tasks.md") from error
+    (plan,) = given
+    if not isinstance(plan, MaskSchedule):
+        what = "None" if plan is None else type(plan).__name__
+        raise TaskError(f"task {name}: schedule(grid) gave {what}, expected a MaskSchedule; see docs/tasks.md")
+    return plan
+
+
+def fault_of(kind: type[Task]) -> str | None:
+    """What is wrong with a task's code, by a plan on `SMALL`; None: nothing, or it needs options or another grid."""
+    missing = dataclasses.MISSING
+    if any(field.default is missing and field.default_factory is missing for field in dataclasses.fields(kind)):  # type: ignore[arg-type]
+        return None
+    error = attempted(lambda: schedule_of(kind(), SMALL))
+    if error is None or (isinstance(error, ValueError) and not isinstance(error, TaskError)):
+        return None
+    return str(error) if isinstance(error, TaskError) else f"task {name_of(kind)}: {told(error)}"

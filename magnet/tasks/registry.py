@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import is_dataclass
 from typing import TypeVar
 
-from magnet.plugins import Registered, Registry, look_here
+from magnet.plugins import Registered, Registry, attempted, look_here
 
 VARIABLE = "MAGNET_TASKS"
 
@@ -64,13 +64,12 @@ def _load_variable(value: str) -> None:
         TASKS.load(snake_case(name), lambda: getattr(importlib.import_module(module), name), origin)
         return
     before = set(TASKS.known)
-    try:
-        importlib.import_module(module)
-        own = [entry.name for entry in TASKS.known.values() if f"{entry.kind.__module__}.".startswith(f"{module}.")]
-        if not own:
-            raise ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
-    except Exception as error:  # a stranger's import may raise anything
-        TASKS.failed[module] = error
+    error = attempted(lambda: importlib.import_module(module))
+    own = [entry.name for entry in TASKS.known.values() if f"{entry.kind.__module__}.".startswith(f"{module}.")]
+    if error is None and not own:
+        error = ValueError(f"{module} registers no task: write {VARIABLE}={module}:Class, or decorate the class")
+    if error is not None:
+        TASKS.fail(module, error, origin)
         return
     for name in {*own, *(set(TASKS.known) - before)}:
         TASKS.add(name, TASKS.known[name].kind, origin)
@@ -117,7 +116,12 @@ def get(name: str) -> type:
     raise ValueError(f"no task named {name}{hint} There are {', '.join(sorted(TASKS.known))}.")
 
 
-def failures() -> dict[str, Exception]:
+def name_of(kind: type) -> str:
+    """The name of a task's class; that of the class itself where it is not registered."""
+    return next((entry.name for entry in TASKS.known.values() if entry.kind is kind), kind.__name__)
+
+
+def failures() -> dict[str, BaseException]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
     return dict(TASKS.failed)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from magnet import checkpoints, cli
+from magnet import checkpoints, cli, plugins
 from magnet.cli import doctor
+from magnet.datamodules.registry import DATA
+from magnet.metrics.registry import METRICS
+from magnet.tasks.registry import TASKS
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -60,3 +64,36 @@ def test_what_is_wrong_ends_with_an_error(
     assert re.search(r"WRONG +model bad +.*damaged", said)
     assert re.search(r"WRONG +CMU +.*holds no \.amc", said)
     assert re.search(r"WRONG +lightning +2\.6\.3", said) and "held malware" in said
+
+
+def test_what_packages_add_is_listed_and_what_failed_has_its_reason(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "theirs_for_doctor.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from magnet.tasks.joint import JointFuture\n"
+        "@dataclass(frozen=True)\n"
+        "class Good(JointFuture): 'Theirs.'\n"
+        "class Bad(Good):\n"
+        "    def schedule(self): pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    points = [
+        EntryPoint("theirs_good", "theirs_for_doctor:Good", "magnet.tasks"),
+        EntryPoint("theirs_bad", "theirs_for_doctor:Bad", "magnet.tasks"),
+        EntryPoint("TheirShoes", "theirs_for_doctor:Shoes", "magnet.datamodules"),
+        EntryPoint("their_number", "shoes_of_mine:Number", "magnet.metrics"),
+    ]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [each for each in points if each.group == group])
+    for registry in (TASKS, DATA, METRICS):
+        monkeypatch.setattr(registry, "known", dict(registry.known))
+        monkeypatch.setattr(registry, "failed", {})
+        monkeypatch.setattr(registry, "discovered", False)
+    assert cli.main(["doctor"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"ok +task theirs_good +of theirs_for_doctor:Good", said)
+    assert re.search(r"WRONG +task theirs_bad +of theirs_for_doctor:Bad: task theirs_bad: schedule\(grid\) fails", said)
+    assert re.search(r"WRONG +data set TheirShoes +of .*: failed to load: AttributeError: .*'Shoes'", said)
+    assert re.search(r"WRONG +metric their_number +of .*: failed to load: ModuleNotFoundError: .*shoes_of_mine", said)
+    assert "mend or uninstall shoes_of_mine:Number; everything else works without it" in said

@@ -7,6 +7,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -46,6 +47,35 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(registry.TASKS.failed, "broken", ImportError("no module named [nowhere]"))
 
 
+def no_grid(self) -> MaskSchedule:
+    raise AssertionError("never called with a grid")
+
+
+def nothing(self, grid: Grid) -> None:
+    grid.past()
+
+
+def failing(self, grid: Grid) -> MaskSchedule:
+    raise KeyError("theirs")
+
+
+def refusing(self, grid: Grid) -> MaskSchedule:
+    raise ValueError("give it a hundred people")
+
+
+FAULTS = {
+    no_grid: r"task odd: schedule\(grid\) fails: TypeError: .*takes 1 positional argument but 2 were given; see docs",
+    nothing: r"task odd: schedule\(grid\) gave None, expected a MaskSchedule; see docs/tasks.md",
+    failing: r"task odd: schedule\(grid\) fails: KeyError: 'theirs'; see docs/tasks.md",
+}
+
+
+def odd(monkeypatch: pytest.MonkeyPatch, schedule: Callable[..., object]) -> None:
+    """Make a task known that plans so."""
+    kind = dataclasses.make_dataclass("Odd", [], namespace={"schedule": schedule, "formula": "P(odd)"}, frozen=True)
+    monkeypatch.setitem(registry.TASKS.known, "odd", Registered("odd", kind, "strange-tasks 3.1"))
+
+
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     assert cli.main(["tasks", *arguments]) == 0
     return capsys.readouterr().out
@@ -81,6 +111,27 @@ def test_show_prints_the_formula_and_how_to_get_a_picture(capsys: pytest.Capture
     assert registry.get(name).formula in text
     assert f"--out {name}.png" in text
     assert " 9 " in text
+
+
+@pytest.mark.parametrize(("schedule", "said"), FAULTS.items())
+def test_a_task_whose_plan_fails_is_marked_and_named_in_a_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, schedule: Callable[..., object], said: str
+) -> None:
+    odd(monkeypatch, schedule)
+    listed = " ".join(printed(capsys).split())
+    assert re.search(f"odd strange-tasks 3.1 P\\(odd\\) .*cannot be sampled: {said}", listed)
+    assert listed.count("cannot be sampled") == 1
+    assert re.fullmatch(f"magnet: error: {said}.*\n", complaint(capsys, "show", "odd"))
+    assert cli.main(["predict", "--task", "odd", "--people", "2", "--frames", "8", "--out", "new.npz"]) == 2
+    assert re.fullmatch(f"magnet: error: {said}.*\n", capsys.readouterr().err)
+
+
+def test_a_task_that_only_refuses_the_grid_is_not_marked(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd(monkeypatch, refusing)
+    assert "cannot be sampled" not in printed(capsys)
+    assert "give it a hundred people" in complaint(capsys, "show", "odd")
 
 
 def test_show_writes_a_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

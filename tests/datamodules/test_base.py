@@ -11,9 +11,10 @@ import torch
 
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules import Clip, Mixed
-from magnet.datamodules.base import EmptySplitError
+from magnet.datamodules.base import EmptySplitError, MotionDataModule
 from magnet.datamodules.options import Augmentation, HeldOutScenes
 from magnet.datamodules.store.windows import dropped
+from magnet.errors import DataError
 from magnet.motion.scene import concatenate
 from magnet.testing import random_scene
 from tests.datamodules.fakes import NOTHING, PLAIN, FakeData, couples_and_singles, one_epoch, random_clip, same
@@ -320,3 +321,30 @@ def test_windows_without_a_stride_are_refused() -> None:
     for stride in (0, -1):
         with pytest.raises(ValueError, match=f"stride: got {stride}, expected at least 1"):
             FakeData([random_clip("a", 100)]).train_scenes(20, stride)
+
+
+def without_split(self):
+    return []
+
+
+def unfinished(self, split):
+    return {}["train"]
+
+
+@pytest.mark.parametrize(
+    ("clips", "said"),
+    [
+        (None, r"clips\('train'\) fails: NotImplementedError: Theirs must implement clips\(split\); see docs/own.md"),
+        (without_split, r"clips\('train'\) fails: TypeError: .*takes 1 positional argument but 2 were given; see"),
+        (unfinished, r"clips\('train'\) fails: KeyError: 'train'; see docs/own.md"),
+        (lambda self, split: None, r"clips\('train'\) gave NoneType, expected a list of Clip"),
+        (lambda self, split: [random_clip("a"), 2], r"clips\('train'\) gave int in its list, expected Clip"),
+    ],
+)
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_data_set_whose_clips_are_none_is_named_with_what_is_wrong(clips, said: str, mixed: bool) -> None:
+    parts = {} if clips is None else {"clips": clips}
+    theirs = type("Theirs", (MotionDataModule,), {"__module__": "their_package", **parts})
+    data = Mixed([theirs()]) if mixed else theirs()
+    with pytest.raises(DataError, match=f"^data set their_package.Theirs: {said}"):
+        data.store("train")

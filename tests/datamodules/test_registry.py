@@ -15,6 +15,7 @@ import yaml
 from magnet import cli, plugins
 from magnet.datamodules import Synthetic, registry
 from magnet.datamodules.prepared import Prepared
+from magnet.datamodules.preparing.check import recognise
 from magnet.datamodules.reading.recording import Reader, Recording, Take
 from magnet.denoiser.module import Denoiser
 
@@ -115,6 +116,57 @@ def test_packages_are_listed_and_one_that_fails_hides_no_other(offered: list[Poi
         registry.reader("Broken")
 
 
+def walks(**parts: Any) -> type[Prepared]:
+    """A data set called Walks whose reader has other parts, or lacks those that are None."""
+    given: dict[str, Any] = {
+        "name": "walks",
+        "title": "Walks of theirs",
+        "source": "https://example.org",
+        "licence": "free",
+        "found": lambda self: [],
+        "read": lambda self, take: None,
+        "__module__": "theirs",
+    }
+    whole = {name: part for name, part in (given | parts).items() if part is not None}
+    return type("Walks", (Prepared,), {"reader": type("WalksReader", (Reader,), whole)})
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ({"name": None}, "has no name"),
+        ({"title": None, "licence": ""}, "has no title and has no licence"),
+        ({"source": 3}, "has no source"),
+        ({"read": None}, "has no read()"),
+        ({"found": None, "read": None}, "has no found() and has no read()"),
+        ({"family": "smplh"}, "has the family 'smplh', expected smplx or smpl or positions or any"),
+        ({"layout": ("NAME.npz",)}, "has the layout ('NAME.npz',), expected pairs such as"),
+        ({"layout": "NAME.npz"}, "has the layout 'NAME.npz', expected pairs such as"),
+    ],
+)
+def test_a_reader_that_lacks_a_part_is_refused_and_named_and_in_nobodys_way(
+    parts: dict[str, Any], said: str, offered: list[Point], capsys, tmp_path: Path
+) -> None:
+    offered.append(Point("Walks", "theirs:Walks", walks(**parts)))
+    registry.discover(again=True)
+    assert cli.main(["data", "list"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "failed to load" in line)
+    assert f"TypeError: reader theirs.WalksReader {said}" in line and "docs/own.md" in line
+    (tmp_path / "nothing").mkdir()
+    assert cli.main(["data", "check", str(tmp_path / "nothing")]) == 2
+    assert "neither a prepared store nor a download that is known" in capsys.readouterr().err
+
+
+def test_a_reader_that_fails_on_a_folder_hides_no_other(offered: list[Point], capsys, tmp_path: Path) -> None:
+    def found(self: Reader) -> list[Take]:
+        raise KeyError("theirs")
+
+    offered.append(Point("Walks", "theirs:Walks", walks(found=found)))
+    registry.discover(again=True)
+    registry.reader("dd100").write_fake(tmp_path, 3, 60)
+    assert recognise(tmp_path) == "dd100"
+
+
 def printed(capsys, *words: str) -> dict[str, Any]:
     assert cli.main(["fit", "--model", "Tokenizer", *words, "--print_config"]) == 0
     return yaml.safe_load(capsys.readouterr().out)["data"]
@@ -136,6 +188,70 @@ def test_a_file_may_name_it_too_also_within_a_mixture(here: Path, capsys) -> Non
     (here / "mixed.yaml").write_text(yaml.safe_dump({"data": {"class_path": "Mixed", "init_args": {"data": parts}}}))
     found = printed(capsys, "--config", "mixed.yaml")["init_args"]["data"]
     assert found[0] == {"class_path": "mine_of_mine.sets.Mine", "init_args": {"takes": 3, "max_agents": 2}}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Broken", "magnet: error: data set Broken failed to load: ImportError: no module named shoes\n"),
+        ("Nowhere", "magnet: error: no data Nowhere; there are Synthetic, "),
+    ],
+)
+@pytest.mark.parametrize("named_by", ["flag", "file"])
+def test_a_data_set_that_is_not_there_is_told_with_the_reason_and_nothing_before_it(
+    name: str, said: str, named_by: str, offered: list[Point], here: Path, capsys
+) -> None:
+    offered.append(Point("Broken", "theirs:Broken", ImportError("no module named shoes")))
+    registry.discover(again=True)
+    (here / "ours.yaml").write_text(yaml.safe_dump({"data": {"class_path": "Synthetic", "init_args": {"seed": 3}}}))
+    (here / "theirs.yaml").write_text(yaml.safe_dump({"data": name}))
+    words = ["--data", name] if named_by == "flag" else ["--config", "theirs.yaml"]
+    assert cli.main(["fit", "--model", "Tokenizer", "--config", "ours.yaml", *words]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(said) and told.count("\n") == 1
+
+
+def test_preparing_says_why_a_reader_is_not_there(offered: list[Point], capsys) -> None:
+    offered.append(Point("Walks", "theirs:Walks", walks(title=None)))
+    registry.discover(again=True)
+    for name, said in {
+        "walks": "data set Walks failed to load: TypeError: reader theirs.WalksReader has no title",
+        "strolling": "(Walks failed to load: magnet data list says why)",
+    }.items():
+        assert cli.main(["data", "prepare", name, "--root", ".", "--out", "store"]) == 2
+        assert said in capsys.readouterr().err
+
+
+OURS = "magnet.datamodules.synthetic.Synthetic"
+MIXTURE = {"class_path": "Mixed", "init_args": {"data": [{"class_path": "Synthetic"}]}}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--data", "Synthetic"], OURS),
+        (["--data=Synthetic", "--data.clip_frames", "70"], OURS),
+        (["--data.class_path", "Synthetic"], OURS),
+        (["--data", yaml.safe_dump({"class_path": "Synthetic"}, default_flow_style=True).strip()], OURS),
+        (["--data", "Mixed", "--data.data", "[Synthetic]"], ["magnet.datamodules.Mixed", OURS]),
+        (["--config", "one.yaml"], OURS),
+        (["--config", "mixed.yaml"], ["magnet.datamodules.Mixed", OURS]),
+        (["--config", "one.yaml", "--data", "mine_of_mine.Synthetic"], "mine_of_mine.Synthetic"),
+    ],
+)
+def test_a_short_name_is_the_registered_class_whatever_a_refused_one_is_called(
+    words: list[str], said: str | list[str], offered: list[Point], here: Path, capsys
+) -> None:
+    (here / "mine_of_mine.py").write_text(MINE.replace("Mine(", "Synthetic("))
+    (here / "one.yaml").write_text(yaml.safe_dump({"data": "Synthetic"}))
+    (here / "mixed.yaml").write_text(yaml.safe_dump({"data": MIXTURE}))
+    registry.import_local("mine_of_mine.Synthetic")
+    offered.append(Point("Synthetic", "mine_of_mine:Synthetic", sys.modules["mine_of_mine"].Synthetic))
+    registry.discover(again=True)
+    assert "name Synthetic is taken" in str(registry.failures()["Synthetic"])
+    got = printed(capsys, *words)
+    paths = [got["class_path"], *(part["class_path"] for part in got["init_args"].get("data", []))]
+    assert paths == ([said] if isinstance(said, str) else said)
 
 
 def test_nothing_of_the_working_directory_takes_the_place_of_a_package(here: Path, capsys) -> None:

@@ -101,6 +101,24 @@ def test_the_training_sets_row_leaves_out_what_columns_say_and_nothing_by_its_na
     assert own == {MODEL: everything - {"miss"}, TRAINING: {"divergence", "mpj_count"}, TRUTH: everything}
 
 
+class OfTheRecording(Divergence):
+    """Fails for the row of the ground truth alone."""
+
+    def measure(self, futures):
+        if self.of == "truth":
+            raise KeyError("of theirs")
+        return super().measure(futures)
+
+
+def test_a_strangers_metric_that_fails_for_one_row_is_left_out_of_all_and_nothing_else_is(monkeypatch, measured):
+    monkeypatch.setattr(METRICS, "discovered", True)
+    known = {"theirs": Registered("theirs", OfTheRecording, "their-package 1.0")}
+    monkeypatch.setattr(METRICS, "known", known)
+    with pytest.warns(UserWarning, match=r"metric theirs is left out, it fails: KeyError: .*\(of their-package 1.0\)"):
+        rows = run(data()).results.rows
+    assert {name: set(row) for name, row in rows.items()} == {name: set(row) for name, row in measured.rows.items()}
+
+
 def test_a_training_stretch_met_again_is_found_by_nearest_neighbour():
     clips = [random_clip("a", 120, 2, split=split) for split in ("train", "test")]
     rows = run(data(clips)).results.rows

@@ -66,6 +66,22 @@ class Unmade(Heads):
         super().__init__(**kwargs)
 
 
+class Higher(Heads):
+    columns: ClassVar = {"higher": Column("higher", "m", "higher", "there is no such direction")}
+
+
+class Strange(Heads):
+    columns: ClassVar = {"strange": Column("strange", "m", "low", "beside what there is not", beside="truth")}
+
+
+class Plain(Heads):
+    columns: ClassVar = {"plain": "no Column"}
+
+
+class Untitled(Heads):
+    columns: ClassVar = {"untitled": Column(None, "m", "low", "without a title")}
+
+
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     points = {
@@ -80,6 +96,10 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "nearest": "Nearest",
         "memorisation": "Heads",
         "unmade": "Unmade",
+        "higher": "Higher",
+        "strange": "Strange",
+        "plain": "Plain",
+        "untitled": "Untitled",
     }
     found = [EntryPoint(name, f"{__name__}:{kind}", "magnet.metrics") for name, kind in points.items()]
     monkeypatch.setattr(plugins, "entry_points", lambda group: found if group == "magnet.metrics" else [])
@@ -94,6 +114,7 @@ def test_they_are_measured_of_samples_and_of_recordings(installed: None) -> None
     with pytest.warns(UserWarning, match="metric .* is left out, it failed to load") as warned:
         made = all_metrics(confidence=0.95)
     left_out = {"nameless", "mine", "variant", "bound", "gone", "FS", "nearest", "memorisation", "unmade"}
+    left_out |= {"higher", "strange", "plain", "untitled"}
     assert {str(each.message).split()[1] for each in warned} == left_out == METRICS.failed.keys()
     recorded = ground_truth_metrics()
     for metrics in (made, recorded):
@@ -131,6 +152,21 @@ def test_names_of_what_a_training_set_gives_are_taken(installed: None) -> None:
     all_metrics()
     assert "something called nearest_training is measured already" in str(METRICS.failed["nearest"])
     assert "something called memorisation is measured already" in str(METRICS.failed["memorisation"])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("higher", "better of column higher: got 'higher', expected low or high or real or \"\""),
+        ("strange", "beside of column strange: got 'truth', expected recording or samples or \"\""),
+        ("plain", "columns has 'plain': 'no Column', expected a Column by a name"),
+        ("untitled", "title of column untitled is None, expected text"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:metric .* is left out")
+def test_what_tables_read_is_checked_before_anything_is_measured(installed: None, name: str, said: str) -> None:
+    all_metrics()
+    assert said in str(METRICS.failed[name])
 
 
 def test_nothing_is_added_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,76 @@
+"""The data set with a reader that the page on own recordings shows, and the example package has."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+
+from magnet import cli
+from magnet.body import load_body
+from magnet.datamodules import registry
+from magnet.errors import DataError
+from magnet.synthesis import synthesize
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "magnet-duel"
+FRAMES = 120
+
+
+@pytest.fixture
+def waltzes(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The module, as an entry point would load it."""
+    registry.discover()
+    monkeypatch.syspath_prepend(EXAMPLE)
+    module = importlib.import_module("magnet_duel.waltzes")
+    registry.register_data("magnet-duel")(module.Waltzes)
+    yield module
+    registry.unregister(module.Waltzes)
+
+
+@pytest.fixture
+def download(tmp_path: Path) -> Path:
+    """Three files as the reader expects them."""
+    body, folder = load_body(), tmp_path / "waltzes"
+    folder.mkdir()
+    for number in range(3):
+        scene = synthesize("mirror", 2, FRAMES, torch.Generator().manual_seed(number), body).scene
+        np.savez(folder / f"waltz_{number}.npz", positions=body.joints(scene)[0].numpy())
+    return folder
+
+
+def test_the_page_shows_the_whole_module() -> None:
+    text = (EXAMPLE / "magnet_duel/waltzes.py").read_text()
+    shown = text.partition("from __future__ import annotations\n\n")[2]
+    assert f"```python\n# magnet_duel/waltzes.py\n{shown}```" in (ROOT / "docs/own.md").read_text()
+
+
+def test_it_is_listed_checked_prepared_and_trained_on(
+    waltzes: ModuleType, download: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "list", "waltzes"]) == 0
+    assert "Waltzes of the Duellists" in capsys.readouterr().out
+    assert cli.main(["data", "check", str(download), "--picture", "none", "--workers", "1"]) == 0
+    store = tmp_path / "store"
+    assert cli.main(["data", "prepare", "waltzes", "--root", str(download), str(store), "--workers", "1"]) == 0
+    assert "--data Waltzes --data.path" in capsys.readouterr().out
+    data = waltzes.Waltzes(path=str(store), window_frames=32, batch_size=2, epoch_size=2)
+    (batch,) = data.train_dataloader()
+    assert tuple(batch.T_world_root.shape) == (2, 32, 2, 4, 4)
+    assert data.folder.clips("test")[0].name == "waltz_2"
+
+
+def test_its_reader_says_what_is_wrong_with_a_file(waltzes: ModuleType, download: Path, tmp_path: Path) -> None:
+    reader = waltzes.WaltzReader(download)
+    np.savez(download / "waltz_0.npz", joints=np.zeros(3))
+    with pytest.raises(DataError, match=r"waltz_0.npz has no positions, only joints; take"):
+        reader.read(reader.takes()[0])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"holds no NAME\.npz; ask"):
+        waltzes.WaltzReader(tmp_path / "empty").found()
