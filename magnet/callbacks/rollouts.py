@@ -41,12 +41,13 @@ class RollOuts(Callback):
     """Rolls the model out from time to time and trains on what it made (ours).
 
     A model that has seen only recorded pasts does not know how to continue its own. So the sampler continues some
-    scenes of the batch over several windows. The training clip whose beginning is nearest to the end of this past is
-    moved there and appended, and the remaining difference fades out. Such scenes replace a share of the batch. The
-    generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv 2512.12080.) A
-    training that is gone on with rolls out at the steps at which it would have; until then it has no generated pasts,
-    for clips and roll-outs are not in its checkpoint. With `cuda_graph` the model's evaluations are replayed, too. A
-    training may have several of other tasks, such as long ones of some; each takes the place of what the other made.
+    scenes of the batch over several windows. The training clip of the same data whose beginning is nearest to the end
+    of this past is moved there and appended, and the remaining difference fades out. Such scenes replace a share of
+    the batch. The generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv
+    2512.12080.) A training that is gone on with rolls out at the steps at which it would have; until then it has no
+    generated pasts, for clips and roll-outs are not in its checkpoint. With `cuda_graph` the model's evaluations are
+    replayed, too. A training may have several of other tasks, such as long ones of some; each takes the place of what
+    the other made.
 
     Args:
         share: share of the batch's scenes that are replaced.
@@ -98,6 +99,7 @@ class RollOuts(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         if not isinstance(pl_module, Denoiser) or not isinstance(batch, Scene):
             raise ValueError("RollOuts: only a Denoiser can be rolled out; leave the callback out of this training")
+        batch = batch.replace(names=kinds_of(trainer, batch))
         self.keep(batch)
         step = trainer.global_step
         due = step >= self.start and (self.filled < 0 or step - self.filled >= self.every)
@@ -142,18 +144,20 @@ class RollOuts(Callback):
     ) -> MadePasts | None:
         """Scenes as long as the batch's whose first half the model has generated; None if none can be continued.
 
-        `precision` is the context in which the model runs; None: the current one.
+        The names of scenes are their kinds, see `kinds_of`; without names all are of one kind. `precision` is the
+        context in which the model runs; None: the current one.
         """
         frames = batch.frames
         past = frames // 2 // TOKEN_FRAMES * TOKEN_FRAMES
         if past < COMPARED:
             raise ValueError(f"RollOuts: got windows of {frames} frames, expected at least {2 * COMPARED}")
         clips = concatenate([each.slice(0, COMPARED + frames - past) for each in self.kept])
-        near = NearestNeighbour(clips.to("cpu"))
+        clips = clips.to("cpu")
+        sizes = NearestNeighbour(clips).stretches
         count = len(self.tasks)
         which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
         task = self.tasks[which]
-        people = torch.tensor([int(n) in near.stretches for n in batch.present.sum(dim=1)])
+        people = torch.tensor([int(n) in sizes for n in batch.present.sum(dim=1)])
         if reads_ahead(task):  # the first slot answers others, who must be there
             people &= (batch.present[:, 0] & batch.present[:, 1:].any(dim=1)).cpu()
         whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()
@@ -170,7 +174,7 @@ class RollOuts(Callback):
             made = self._continued(model, start, task, more, generator)
         model.train(training)
         made = made.slice(made.frames - past)
-        behind = near(made.slice(past - COMPARED).to("cpu"), frames - past).to(made.device)
+        behind = recorded_behind(made.slice(past - COMPARED).to("cpu"), clips, frames - past).to(made.device)
         return MadePasts(cat_time([made, eased(made, behind, self.return_frames)]), past // TOKEN_FRAMES, self.share)
 
     def _continued(self, model: Denoiser, start: Scene, task: Task, more: int, generator: torch.Generator) -> Scene:
@@ -185,6 +189,38 @@ class RollOuts(Callback):
 def reads_ahead(task: Task) -> bool:
     """Whether a task reads what comes after the past: of somebody who is given, or at keyframes."""
     return not torch.equal(schedule_of(task, GOING_ON).known, GOING_ON.past())
+
+
+def kinds_of(trainer: Trainer, batch: Scene) -> tuple[str, ...]:
+    """Of which kind each scene is, where the trainer's data tell."""
+    tell = getattr(getattr(trainer, "datamodule", None), "kinds_of", None)
+    return tell(batch.names) if tell is not None and batch.names else ()
+
+
+def recorded_behind(past: Scene, clips: Scene, frames: int) -> Scene:
+    """The clip of the same kind that begins most like the end of a past, moved there.
+
+    Were it of any kind, couples who drift would learn to go over to another kind of motion and stay with it: no
+    recording leads back.
+
+    Args:
+        past: (B, T, P) ends of generated pasts. Names are kinds.
+        clips: (M, T + frames, P) recorded. Those of all kinds are looked at where a kind has none of so many people.
+        frames: of the continuation.
+
+    Returns:
+        (B, frames, P).
+    """
+    ours, theirs = past.names or ("",) * past.scenes, clips.names or ("",) * clips.scenes
+    where = {kind: [k for k, of in enumerate(theirs) if of == kind] for kind in set(ours) & set(theirs)}
+    nearest = {kind: NearestNeighbour(clips.select(mine)) for kind, mine in where.items()}
+    everybody = NearestNeighbour(clips)
+    found = []
+    for b, kind in enumerate(ours):
+        one = past.select([b])
+        same = nearest.get(kind, everybody)
+        found.append((same if int(one.present.sum()) in same.stretches else everybody)(one, frames))
+    return concatenate(found)
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from magnet.body import Body, load_body
-from magnet.datamodules.clip import Clip, Split, at_least
+from magnet.datamodules.clip import RESHAPED, Clip, Split, at_least
 from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store.memory import MemoryStore, WindowIndex
@@ -227,6 +227,10 @@ class MotionDataModule(LightningDataModule):
             return []
         windows = fixed_windows(store, self.window_frames, self.window_frames, pad=True)
         return self._fixed("val", windows, self.window_frames, self.val_batch_size)
+
+    def kinds_of(self, labels: Sequence[str]) -> tuple[str, ...]:
+        """The source of each training scene, by its label; on other bodies a dance is the same dance."""
+        return tuple(source.replace(RESHAPED, "") for source in self.store("train").sources_of(labels))
 
     def test_dataloader(self) -> FixedLoader:
         """Context and horizon of scenes of the test split (test.batch_size, context + horizon, max_agents)."""

@@ -13,6 +13,8 @@ from magnet.motion.scene import Scene, require_rotations
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 Ints = NDArray[np.int64]
+RESHAPED = "-reshaped"
+"""What stands behind the source of clips whose people have been given other bodies."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from magnet.body.other_shapes import with_shapes
 from magnet.datamodules.base import Clip, MotionDataModule, Split, clips_of
-from magnet.datamodules.clip import at_least
+from magnet.datamodules.clip import RESHAPED, at_least
 from magnet.datamodules.mixed import Parts
 from magnet.datamodules.preparing.progress import progress_bar
 from magnet.datamodules.registry import register_data
@@ -87,7 +87,7 @@ class Reshaped(Parts):
         wanted = self._wanted()
         self._fill(wanted)
         return [
-            Clip(self._loaded(file, wanted), f"{clip.name} reshaped {number}", f"{clip.source}-reshaped", split)
+            Clip(self._loaded(file, wanted), f"{clip.name} reshaped {number}", f"{clip.source}{RESHAPED}", split)
             for clip, number, _, file in wanted
         ]
 

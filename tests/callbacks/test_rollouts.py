@@ -8,7 +8,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from magnet import checkpoints
 from magnet.callbacks import RollOuts
-from magnet.callbacks.rollouts import eased
+from magnet.callbacks.rollouts import eased, kinds_of, recorded_behind
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.rotations import geodesic
@@ -83,6 +83,38 @@ def test_nothing_is_rolled_out_where_nobody_has_been_seen(made):
     rolling = RollOuts(scenes=4, frames=(32, 32), steps=2)
     rolling.keep(batch.select([2, 5]))  # scenes of one person alone
     assert rolling.rolled_out(model, batch.select([0, 1]), torch.Generator().manual_seed(1)) is None
+
+
+def test_what_follows_is_of_the_same_kind_even_where_another_is_nearer() -> None:
+    scene = random_scene(3, 48, 1, torch.Generator().manual_seed(0))
+    ends, after = scene.slice(0, 16), scene.slice(16).body_rot
+    torch.testing.assert_close(recorded_behind(ends, scene, 32).body_rot, after)  # each is nearest to itself
+    clips = scene.replace(names=("dance", "walk", "dance"))
+    behind = recorded_behind(ends.replace(names=("walk", "walk", "sit")), clips, 32)
+    torch.testing.assert_close(behind.body_rot[:2], after[[1, 1]])
+    torch.testing.assert_close(behind.body_rot[2], after[2])  # nobody sits: any will do
+
+
+def test_where_a_kind_has_none_of_so_many_people_any_will_do() -> None:
+    scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
+    clips = scene.replace(names=("walk", "dance"), present=torch.tensor([[True, False], [True, True]]))
+    behind = recorded_behind(scene.slice(0, 16).select([0]).replace(names=("walk",)), clips, 32)
+    theirs = scene.slice(16).body_rot[1]
+    assert min((behind.body_rot[0] - theirs[:, order]).abs().max() for order in ([0, 1], [1, 0])) < 1e-5
+
+
+def test_kinds_are_told_by_the_data(tmp_path) -> None:
+    module = data()
+    module.setup("fit")
+    windows = module.train_scenes(16, composed=2)
+    fitter = trainer(1, default_root_dir=tmp_path)
+    assert kinds_of(fitter, windows) == ()
+    fitter.datamodule = module  # type: ignore[attr-defined]
+    assert kinds_of(fitter, windows.replace(names=())) == ()
+    *kinds, one, other = kinds_of(fitter, windows)
+    assert set(kinds) == {"couples", "singles"}
+    assert all({*composed.split("+")} <= set(kinds) for composed in (one, other) if "+" in composed)
+    assert "+" in one and "+" in other
 
 
 @pytest.mark.parametrize("frames", [8, 24])

@@ -18,6 +18,9 @@ from magnet.motion.frames import from_planar
 from magnet.motion.planar import rotate_ground
 from magnet.motion.scene import BODY_JOINTS, Scene
 
+COMPOSED, BESIDE = "composed: ", " + "
+"""What the label of a scene of two clips begins with, and what stands between their labels."""
+
 
 @dataclass(frozen=True)
 class WindowIndex:
@@ -217,9 +220,19 @@ class MemoryStore:
             return f"{self.names[clip]} [{start}:{min(start + frames, self.length[clip])}]"
 
         return tuple(
-            label(a, s) if b < 0 else f"composed: {label(a, s)} + {label(b, z)}"
+            label(a, s) if b < 0 else f"{COMPOSED}{label(a, s)}{BESIDE}{label(b, z)}"
             for (a, b), (s, z) in zip(windows.clips.tolist(), windows.starts.tolist(), strict=True)
         )
+
+    def sources_of(self, labels: Sequence[str]) -> tuple[str, ...]:
+        """The source of each scene's clip, by its label; both, joined by +, where it is composed; "": unknown."""
+        source = dict(zip(self.names, self.sources.tolist(), strict=True))
+
+        def of(label: str) -> str:
+            parts = label.removeprefix(COMPOSED).split(BESIDE) if label.startswith(COMPOSED) else [label]
+            return "+".join(source.get(part.rsplit(" [", 1)[0], "") for part in parts)
+
+        return tuple(map(of, labels))
 
 
 def place_apart(
