@@ -157,6 +157,14 @@ def nan_in_row(rows: list[str]) -> list[str]:
     return [*rows[:2], rows[2].rpartition(",")[0] + ",nan", *rows[3:]]
 
 
+def untracked(take: Take) -> None:
+    """BVH: a NaN in every frame of the first person; frames that hold none would be kept."""
+    head, mark, rows = take.files[0].read_text().partition("Frame Time:")
+    seconds, *rows = rows.rstrip().splitlines()
+    rows = [re.sub(r"\S+\s*$", "nan", row) for row in rows]
+    take.files[0].write_text("\n".join([f"{head}{mark}{seconds}", *rows]) + "\n")
+
+
 def text(pattern: str, other: str) -> Damage:
     """BVH: the first person's file with something else in one place."""
 
@@ -198,7 +206,7 @@ REMOCAP: dict[str, Damage] = {
 }
 BVH: dict[str, Damage] = {
     "truncated": lambda take: cut(take.files[0]),
-    "NaN": text(r"\S+\s*\Z", "nan\n"),
+    "NaN": untracked,
     "zero frames": text(r"Frames: \d+", "Frames: 0"),
     "wrong shape": text(r"CHANNELS 3 \S+ ", "CHANNELS 2 "),
 }
