@@ -11,17 +11,10 @@ import pytest
 import torch
 from torchmetrics import MetricCollection
 
-from magnet.metrics import ClipMeans, Column, MotionMetric
-from magnet.metrics.base import clip_sums
+from magnet.metrics import MotionMetric
 from magnet.metrics.guarded import Guarded, guarded, lost_numbers
 from tests.metrics.batches import draw_batch
-
-
-class Heads(ClipMeans):
-    columns: ClassVar = {"head_height": Column("head", "m", "real", "how high heads are")}
-
-    def measure(self, futures):
-        return [clip_sums(futures.generated[..., 15, 1], futures.scored)]
+from tests.metrics.test_registry import Calls, Heads
 
 
 class Divides(Heads):
@@ -49,19 +42,11 @@ class Framewise(Heads):
         return [(futures.generated[0, ..., 0, 15, 1], futures.scored[..., 0])]
 
 
-class Sums(MotionMetric):
-    columns: ClassVar = {"calls": Column("calls", "", "", "how often it was fed")}
+class Sums(Calls):
     result: ClassVar[Any] = None
 
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self.add_sum("calls")
-
-    def add(self, futures):
-        self.calls += 1
-
     def compute(self):
-        return {"calls": self.calls} if self.result is None else self.result
+        return super().compute() if self.result is None else self.result
 
 
 class Computes(Sums):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -224,13 +225,16 @@ class MemoryStore:
             for (a, b), (s, z) in zip(windows.clips.tolist(), windows.starts.tolist(), strict=True)
         )
 
+    @cached_property
+    def _source_of(self) -> dict[str, str]:
+        return dict(zip(self.names, self.sources.tolist(), strict=True))
+
     def sources_of(self, labels: Sequence[str]) -> tuple[str, ...]:
         """The source of each scene's clip, by its label; both, joined by +, where it is composed; "": unknown."""
-        source = dict(zip(self.names, self.sources.tolist(), strict=True))
 
         def of(label: str) -> str:
             parts = label.removeprefix(COMPOSED).split(BESIDE) if label.startswith(COMPOSED) else [label]
-            return "+".join(source.get(part.rsplit(" [", 1)[0], "") for part in parts)
+            return "+".join(self._source_of.get(part.rsplit(" [", 1)[0], "") for part in parts)
 
         return tuple(map(of, labels))
 
