@@ -21,9 +21,9 @@ LEVER = 1.0
 class Retrieval:
     """Stretches of training motion, by how many people are in them.
 
-    A stretch answers a context with as many people; its people may play any of the context's. Its motion
-    is given to the context's bodies (`betas` are the context's), so on bodies of another size feet float or
-    sink a little. Stretches with a masked frame are not used.
+    A stretch answers a context with as many people; its people may play any of the context's. They keep the
+    bodies that they were recorded with: on the context's, feet would float or sink, and hands would miss each
+    other. Stretches with a masked frame are not used.
 
     Args:
         train: (M, context + horizon, P) stretches; may be padded with absent agents.
@@ -77,7 +77,7 @@ class Retrieval:
                 fits best, or in order where nothing is aligned. Read only where an agent is present.
 
         Returns:
-            (B, horizon, P) with the context's betas, presence and names.
+            (B, horizon, P) with the context's presence and names, and the betas of those recorded.
         """
         chosen = chosen.to(self.train.device)
         now = canonical_frame(context.T_world_root)[:, -1].to(self.train.device)
@@ -93,11 +93,13 @@ class Retrieval:
         if self.aligned:
             T_new_world = best_move(then[scene, slots], now, context.present.to(self.train.device))
             T_world_root = T_new_world.to(T_world_root.dtype)[:, None, None] @ T_world_root
+        betas = self.train.betas[chosen[:, None], slots].to(context.betas)
         there = context.present[:, None, :, None, None]
         eye = torch.eye(4, dtype=T_world_root.dtype, device=context.device)
         return context.replace(
             body_rot=torch.where(there[..., None], body_rot.to(context.device), eye[:3, :3]),
             T_world_root=torch.where(there, T_world_root.to(context.device), eye),
+            betas=torch.where(context.present[..., None], betas, context.betas),
             valid=None,
         )
 

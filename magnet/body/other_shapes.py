@@ -9,6 +9,7 @@ from torch import Tensor
 
 from magnet.body.base import Body
 from magnet.body.fit import clearance
+from magnet.body.floor import counting, lowest, off_floor
 from magnet.body.joints import ANKLES, FEET, HIPS, KNEES
 from magnet.body.reach import reach
 from magnet.body.repair import UPRIGHT
@@ -22,7 +23,8 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
 
     Hips are higher or lower as legs are longer or shorter, ankles stay where they were over the ground, then poses are
     corrected together: hands that held hold again, standing feet stay still, bodies are no deeper in each other than
-    `firm` allows. Where arms are too short for it, people come nearer to each other.
+    `firm` allows. Where arms are too short for it, people come nearer to each other. A scene far from y = 0 has its own
+    floor and stays there.
 
     Args:
         scene: (B, T, P).
@@ -34,6 +36,9 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
     """
     if betas.shape != scene.betas.shape:
         raise ValueError(f"betas: got {tuple(betas.shape)}, expected {tuple(scene.betas.shape)}")
+    floor = off_floor(lowest(scene, body), counting(scene))
+    if floor.any():
+        return _raised(with_shapes(_raised(scene, -floor), betas, body), floor)
     betas = betas.to(scene.betas)
     people = scene.betas.shape[:2]
     soles, other_soles = (clearance(body, each.flatten(0, 1)).unflatten(0, people) for each in (scene.betas, betas))
@@ -54,6 +59,13 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
     recorded = Wishes.of(scene, body, "firm")
     wishes = replace(Wishes.of(changed, body, "firm"), held=recorded.held, between=recorded.between)
     return corrected(changed, correction(changed, body, wishes, settle=Settle(tilt=UPRIGHT)))
+
+
+def _raised(scene: Scene, metres: Tensor) -> Scene:
+    """metres: (B,)"""
+    T_world_root = scene.T_world_root.clone()
+    T_world_root[..., 1, 3] += metres[:, None, None]
+    return scene.replace(T_world_root=T_world_root)
 
 
 def _legs(body: Body, betas: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from magnet.baselines.nearest_neighbour import NearestNeighbour
+from magnet.body import Body
+from magnet.body.other_shapes import with_shapes
 from magnet.checks import require_number, require_whole
 from magnet.denoiser.compiled import records
 from magnet.denoiser.module import Denoiser
@@ -42,12 +45,12 @@ class RollOuts(Callback):
 
     A model that has seen only recorded pasts does not know how to continue its own. So the sampler continues some
     scenes of the batch over several windows. The training clip of the same data whose beginning is nearest to the end
-    of this past is moved there and appended, and the remaining difference fades out. Such scenes replace a share of
-    the batch. The generated past is shown clean and does not count in the loss. (The idea is that of BAgger, arXiv
-    2512.12080.) A training that is gone on with rolls out at the steps at which it would have; until then it has no
-    generated pasts, for clips and roll-outs are not in its checkpoint. With `cuda_graph` the model's evaluations are
-    replayed, too. A training may have several of other tasks, such as long ones of some; each takes the place of what
-    the other made.
+    of this past is moved there, put on the same bodies and appended, and the remaining difference fades out. Such
+    scenes replace a share of the batch. The generated past is shown clean and does not count in the loss. (The idea is
+    that of BAgger, arXiv 2512.12080.) A training that is gone on with rolls out at the steps at which it would have;
+    until then it has no generated pasts, for clips and roll-outs are not in its checkpoint. With `cuda_graph` the
+    model's evaluations are replayed, too. A training may have several of other tasks, such as long ones of some; each
+    takes the place of what the other made.
 
     Args:
         share: share of the batch's scenes that are replaced.
@@ -174,7 +177,8 @@ class RollOuts(Callback):
             made = self._continued(model, start, task, more, generator)
         model.train(training)
         made = made.slice(made.frames - past)
-        behind = recorded_behind(made.slice(past - COMPARED).to("cpu"), clips, frames - past).to(made.device)
+        behind = recorded_behind(made.slice(past - COMPARED).to("cpu"), clips, frames - past)
+        behind = on_bodies(behind, made.betas.cpu(), model.require_body()).to(made.device)
         return MadePasts(cat_time([made, eased(made, behind, self.return_frames)]), past // TOKEN_FRAMES, self.share)
 
     def _continued(self, model: Denoiser, start: Scene, task: Task, more: int, generator: torch.Generator) -> Scene:
@@ -209,7 +213,7 @@ def recorded_behind(past: Scene, clips: Scene, frames: int) -> Scene:
         frames: of the continuation.
 
     Returns:
-        (B, frames, P).
+        (B, frames, P), on the bodies of those recorded.
     """
     ours, theirs = past.names or ("",) * past.scenes, clips.names or ("",) * clips.scenes
     where = {kind: [k for k, of in enumerate(theirs) if of == kind] for kind in set(ours) & set(theirs)}
@@ -221,6 +225,16 @@ def recorded_behind(past: Scene, clips: Scene, frames: int) -> Scene:
         same = nearest.get(kind, everybody)
         found.append((same if int(one.present.sum()) in same.stretches else everybody)(one, frames))
     return concatenate(found)
+
+
+def on_bodies(behind: Scene, betas: Tensor, body: Body) -> Scene:
+    """A recorded continuation by people of other shapes, whose feet stand and whose hands hold as recorded.
+
+    Without a body that knows the shapes, the same poses. behind on the CPU, betas (B, P, 10), body anywhere.
+    """
+    if behind.body != body.id:
+        return behind.replace(betas=betas)
+    return with_shapes(behind, betas, copy.deepcopy(body).cpu())
 
 
 def eased(made: Scene, behind: Scene, frames: int) -> Scene:

@@ -158,6 +158,19 @@ def test_unaligned_random_samples_are_training_motion_untouched(train: Scene) ->
         assert any(torch.equal(scene, recorded[:, :2]) for recorded in futures.T_world_root)
 
 
+@pytest.mark.parametrize("which", [NearestNeighbour, RandomSample])
+def test_retrieved_motion_keeps_the_bodies_it_was_recorded_with(which: type) -> None:
+    """Whoever plays whom: on the bodies of the context feet would float or sink."""
+    one = wander(1, 2, seed=3)
+    swapped = one.permute_agents(torch.tensor([1, 0])).slice(0, CONTEXT)
+    got = which(one)(swapped, HORIZON, generator=torch.Generator().manual_seed(0))
+    recorded = {
+        tuple(pose.flatten().tolist()): betas for pose, betas in zip(one.body_rot[0, -1], one.betas[0], strict=True)
+    }
+    for pose, betas in zip(got.body_rot[0, -1], got.betas[0], strict=True):
+        assert torch.equal(recorded[tuple(pose.flatten().tolist())], betas)
+
+
 @pytest.mark.parametrize("which", ["nearest", "random", "hold"])
 def test_what_comes_back_has_the_contexts_people(train: Scene, which: str) -> None:
     context = concatenate([wander(2, 2, seed=11), wander(3, 4, seed=12)]).slice(0, CONTEXT)
@@ -166,7 +179,10 @@ def test_what_comes_back_has_the_contexts_people(train: Scene, which: str) -> No
     got = baseline(context, HORIZON, samples=3, generator=torch.Generator().manual_seed(0))
     assert got.T_world_root.shape == (15, HORIZON, 4, 4, 4)
     assert got.body_rot.shape == (15, HORIZON, 4, 21, 3, 3)
-    assert torch.equal(got.betas, context.betas.repeat_interleave(3, dim=0))
+    betas = context.betas.repeat_interleave(3, dim=0)
+    kept = got.present if which != "hold" else torch.zeros_like(got.present)
+    assert torch.equal(got.betas[~kept], betas[~kept])
+    assert not bool((got.betas[kept] == betas[kept]).all(dim=-1).any()), "recorded motion is of those recorded"
     assert torch.equal(got.present, context.present.repeat_interleave(3, dim=0))
     assert got.names == tuple(name for name in "abcde" for _ in range(3))
     assert got.fps == context.fps and got.body == context.body

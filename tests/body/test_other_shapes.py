@@ -56,6 +56,14 @@ def test_with_their_own_shapes_people_move_as_before(handshake: Scene) -> None:
     assert float(off.mean()) < 0.02
 
 
+def test_who_stands_far_from_the_floor_stays_there(handshake: Scene, changed: Scene) -> None:
+    T_world_root = handshake.T_world_root.clone()
+    T_world_root[..., 1, 3] += 3.0
+    raised = with_shapes(handshake.replace(T_world_root=T_world_root), ONE_EACH_WAY, BODY)
+    off = (BODY.joints(raised) - BODY.joints(changed) - torch.tensor([0.0, 3.0, 0.0])).norm(dim=-1)
+    assert float(off.mean()) < 0.005 and float(off.max()) < 0.03  # its floor is found from its lowest frames
+
+
 def test_too_few_shapes_are_refused(handshake: Scene) -> None:
     with pytest.raises(ValueError, match=r"betas: got \(1, 1, 10\), expected \(1, 2, 10\)"):
         with_shapes(handshake, handshake.betas[:, :1], BODY)

@@ -7,18 +7,23 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from magnet import checkpoints
+from magnet.body import load_body
+from magnet.body.floor import lowest
 from magnet.callbacks import RollOuts
-from magnet.callbacks.rollouts import eased, kinds_of, recorded_behind
+from magnet.callbacks.rollouts import eased, kinds_of, on_bodies, recorded_behind
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
 from magnet.tasks.joint import JointFuture
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene, tiny_denoiser
 from tests.denoiser.test_module import data, trainer
 
 FRAMES = 64
+HEAD = 14
+"""Of the rotations of a body."""
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +48,13 @@ def test_they_are_as_long_as_training_scenes_and_keep_who_is_there(made):
 def test_the_past_is_made_and_what_follows_is_recorded(made):
     """Only recorded poses come after the seam, and only made ones before it."""
     batch, pasts, _ = made
-    recorded = batch.body_rot.flatten(0, 2)[:, 0]  # one joint's rotations
+    recorded = batch.body_rot.flatten(0, 2)[:, HEAD]  # legs and arms change with the bodies
 
     def found(pose: torch.Tensor) -> bool:
         return bool((geodesic(recorded, pose) < 1e-3).any())
 
-    assert not found(pasts.scenes.body_rot[0, FRAMES // 4, 0, 0])
-    assert found(pasts.scenes.body_rot[0, -1, 0, 0])
+    assert not found(pasts.scenes.body_rot[0, FRAMES // 4, 0, HEAD])
+    assert found(pasts.scenes.body_rot[0, -1, 0, HEAD])
 
 
 def test_windows_that_are_too_short_for_a_past_are_refused(made):
@@ -93,6 +98,22 @@ def test_what_follows_is_of_the_same_kind_even_where_another_is_nearer() -> None
     behind = recorded_behind(ends.replace(names=("walk", "walk", "sit")), clips, 32)
     torch.testing.assert_close(behind.body_rot[:2], after[[1, 1]])
     torch.testing.assert_close(behind.body_rot[2], after[2])  # nobody sits: any will do
+
+
+def test_what_follows_stands_and_holds_hands_on_the_bodies_of_the_past() -> None:
+    body = load_body()
+    scene = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(40, 88)
+    betas = torch.zeros(1, 2, 10)
+    betas[0, :, 0] = torch.tensor([1.5, -1.5])
+    ends = scene.slice(0, 16).replace(betas=betas)
+    behind = recorded_behind(ends, scene, 32)
+    torch.testing.assert_close(behind.betas, scene.betas)
+    after = on_bodies(behind, betas, body)
+    torch.testing.assert_close(after.betas, betas)
+    assert float(lowest(behind.replace(betas=betas), body).amin(dim=1).abs().max()) > 0.02
+    assert float(lowest(after, body).amin(dim=1).abs().max()) < 0.01
+    other = on_bodies(behind.replace(body="smplx-neutral"), betas, body)
+    assert torch.equal(other.body_rot, behind.body_rot) and torch.equal(other.betas, betas)
 
 
 def test_where_a_kind_has_none_of_so_many_people_any_will_do() -> None:
