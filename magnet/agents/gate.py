@@ -22,7 +22,9 @@ LATENT = 100.0
 UNIT = 1e-2
 """How far the length of a quaternion may be from 1; it is made 1 when it is read."""
 AHEAD, BEHIND = 300, 300
-"""Frames before and after one's own that are of use."""
+"""Frames after and before one's own that are of use."""
+GONE = 64
+"""Frames, 2.1 s, after which who has told nothing may come back anywhere: models look no further back."""
 
 
 class Gate:
@@ -52,6 +54,8 @@ class Gate:
         self.now: int | None = None
         self._sessions: dict[str, int] = {}
         self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
+        # Where whose pelvis was by whom, by frame. What one sender tells of another binds nobody else.
+        self._places: dict[tuple[str, str], dict[int, np.ndarray]] = {}
 
     def take(self, parts: Sequence[bytes], at: float, peer: str | None = None) -> Message | None:
         """A message, if it is right and for this agent; None, and a count more, if not.
@@ -72,6 +76,7 @@ class Gate:
             self.refused[str(reason)] += 1
             return None
         self._sessions[message.sender] = message.session
+        self._note(message)
         self.taken += 1
         return message
 
@@ -102,7 +107,7 @@ class Gate:
         place, units = poses[:, :3], poses[:, 3:].reshape(len(poses), (POSE - 3) // 4, 4)
         if (np.abs(place[:, [0, 2]]) > FAR).any() or (np.abs(place[:, 1]) > HIGH).any():
             raise RefusedMessage("range")
-        if (np.linalg.norm(np.diff(place, axis=0), axis=1) > STEP).any():
+        if (np.linalg.norm(np.diff(place, axis=0), axis=1) > STEP).any() or self._jumps(message):
             raise RefusedMessage("speed")
         with np.errstate(over="ignore"):
             lengths = np.linalg.norm(units.astype(np.float64), axis=2)
@@ -110,6 +115,22 @@ class Gate:
             raise RefusedMessage("rotation")
         if message.token is not None and message.model == self.model:
             self._token(message.token, place)
+
+    def _jumps(self, message: Message) -> bool:
+        """Whether a pelvis is further from where it was taken to be, at most `GONE` frames away, than it can move."""
+        known = self._places.get((message.sender, message.agent))
+        if not known or not len(message.poses):
+            return False
+        own = message.frame + np.arange(len(message.poses))
+        away = np.abs(own[:, None] - np.array(list(known)))
+        moved = np.linalg.norm(message.poses[:, None, :3] - np.array(list(known.values())), axis=-1)
+        return bool(((away <= GONE) & (moved > STEP * np.maximum(away, 1))).any())
+
+    def _note(self, message: Message) -> None:
+        known = self._places.setdefault((message.sender, message.agent), {})
+        known.update({message.frame + n: pose[:3].copy() for n, pose in enumerate(message.poses)})
+        while len(known) > AHEAD + BEHIND:
+            del known[min(known)]
 
     def _token(self, token: np.ndarray, place: np.ndarray) -> None:
         if len(token) != self.latent + TOKEN * 16:

@@ -152,3 +152,46 @@ def test_what_is_told_somebody_else_of_its_past_is_neither_taken_nor_refused():
     assert ours.take(pack(dataclasses.replace(message(token=False), agent="C")), 0.0, peer="B") is None
     assert (ours.taken, ours.passed_over, dict(ours.refused)) == (0, 1, {})
     assert ours.take(pack(dataclasses.replace(message(4000, token=False), agent="A")), 0.0, peer="B") is not None
+
+
+def at(frame: int, x: float, count: int = 1, **fields) -> list[bytes]:
+    """A message of somebody who stands at x metres."""
+    sent = message(frame, count, token=False)
+    sent.poses[:, 0] = x
+    return pack(dataclasses.replace(sent, **fields))
+
+
+def test_a_pelvis_that_jumps_from_one_message_to_the_next_is_refused():
+    ours = gate()
+    places = [(8, 0.0), (9, 500.0), (10, -500.0), (9, 0.9), (11, 3.1), (11, 2.8), (11, 4.2), (10, 1.85)]
+    taken = [ours.take(at(*place), 0.0) is not None for place in places]
+    assert taken == [True, False, False, True, False, True, False, True]
+    assert dict(ours.refused) == {"speed": 4}
+
+
+def test_frames_that_come_late_are_compared_with_those_before_and_behind_them():
+    ours = gate()
+    assert ours.take(at(12, 0.0, 4), 0.0) and ours.take(at(20, 0.0, 4), 0.0)
+    assert ours.take(at(16, 30.0, 4), 0.0) is None and ours.take(at(16, 0.5, 4), 0.0)
+    assert ours.take(at(16, 0.5, 4), 0.0), "told again"
+
+
+def test_who_was_gone_for_two_seconds_comes_back_where_they_are_and_not_sooner():
+    for away, back in ((64, False), (65, True)):
+        ours = gate()
+        assert ours.take(at(8, 0.0), 0.0)
+        assert (ours.take(at(8 + away, 400.0), 0.0) is not None) == back
+        assert (ours.take(at(9 + away, 400.5), 0.0) is not None) or not back
+    ours = gate()
+    assert ours.take(at(8, 0.0), 0.0)
+    tries = [ours.take(at(8 + frame, 400.0), 0.0) is not None for frame in range(1, 80)]
+    assert tries.index(True) == 64 and all(tries[64:]), "also who goes on telling from there"
+    assert ours.take(at(88, 0.0, session=8), 0.0) is None, "a new process of theirs does not make a jump right"
+
+
+def test_what_others_tell_of_somebody_binds_only_what_they_tell():
+    """Who has come back is told of its own past by everybody; one who tells it wrong keeps nobody else out."""
+    ours = Gate(("A", "B", "C"), "A", "feed", LATENT)
+    assert ours.take(at(8, 300.0, agent="A"), 0.0, peer="B")
+    mine = dataclasses.replace(message(8, 1, token=False), sender="C", agent="A")
+    assert ours.take(pack(mine), 0.0, peer="C") and ours.take(at(8, 0.0), 0.0, peer="B")
