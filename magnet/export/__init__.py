@@ -9,9 +9,12 @@ from magnet.export.picture import contact_sheet
 from magnet.export.retarget import load_bvh
 from magnet.export.video import render_video
 from magnet.motion.resample import resampled
+from magnet.motion.tracked import LiveFrames, bridged
 
 __all__ = [
     "Camera",
+    "LiveFrames",
+    "bridged",
     "contact_sheet",
     "load_bvh",
     "load_smplx",

@@ -375,8 +375,8 @@ def require_rate(scene: Scene, label: str = "the scene") -> None:
         raise ValueError(f"{label}: got {type(scene).__name__}, expected a Scene; magnet.read(path) reads one")
     if abs(scene.fps - FPS) > 1e-3:
         raise ValueError(
-            f"{label} runs at {scene.fps:g} fps, the model at {FPS:g}: bring it there with "
-            f"magnet export IN.npz OUT.npz --fps {FPS:g}, or magnet.export.resampled(scene, {FPS:g})"
+            f"{label} runs at {scene.fps:g} fps, the model at {FPS:g}: bring it there with magnet export IN.npz OUT.npz"
+            f" --fps {FPS:g}, magnet.export.resampled(scene, {FPS:g}) or, live, pose by pose, magnet.export.LiveFrames"
         )
 
 
