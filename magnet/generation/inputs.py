@@ -92,7 +92,7 @@ def check_given(scene: Scene, known: Tensor, any_floor: bool = False) -> None:
     if not bool(counts.any()):
         return
     finite = part.body_rot.flatten(3).isfinite().all(-1) & part.T_world_root.flatten(3).isfinite().all(-1)  # (B, F, P)
-    _refuse(~finite & counts, frames, scene, "is not finite: leave such frames out, or fill them in")
+    _refuse(~finite & counts, frames, scene, "is not finite: fill such frames in, as with the last finite pose")
     _refuse(
         ~_rigid(part) & counts,
         frames,

@@ -1,5 +1,8 @@
 """A partner who answers live."""
 
+import copy
+import pickle
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ import magnet
 from magnet.api import Model
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.lean import lean
+from magnet.export import bridged
 from magnet.generation import rollout
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
@@ -172,20 +176,123 @@ def test_a_partner_who_was_interrupted_half_way_says_so(model, duet, monkeypatch
         broken.setattr(type(model), "denoise", lambda *words, **named: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             partner.answer(duet.slice(16, 20))
-    with pytest.raises(RuntimeError, match="interrupted half-way; begin a new Partner"):
+    with pytest.raises(RuntimeError, match=r"interrupted half-way; begin a new Partner, .*on with frame 0 of all"):
         partner.answer(duet.slice(16, 20))
     again = Partner(model, partner.past, (0,), FAST)
     assert again.answer(duet.slice(16, 20)).frames == 4
+
+
+def test_who_was_interrupted_says_up_to_where_its_past_goes(model, duet, monkeypatch):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    partner.answer(duet.slice(16, 24))
+    denoise, times = type(model).denoise, iter(range(FAST.steps + 1))
+
+    def once(*words, **named):
+        if next(times) == FAST.steps:
+            raise KeyboardInterrupt
+        return denoise(*words, **named)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(type(model), "denoise", once)
+        with pytest.raises(KeyboardInterrupt):
+            partner.answer(duet.slice(24, 32))  # in its second token
+    with pytest.raises(RuntimeError, match="on with frame 12 of all"):
+        partner.answer(duet.slice(24, 32))
+    assert torch.equal(partner.past.T_world_root[:, -1, 1], duet.T_world_root[:, 16 + 12 - 1, 1])
+    Partner(model, partner.past, (0,), FAST).answer(duet.slice(16 + 12, 32))
+
+
+def test_threads_that_share_a_partner_wait_for_each_other(model, duet):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    held, answers, wrong = duet.slice(15, 16).pad_frames(2).slice(0, 4), [], []
+
+    def ask() -> None:
+        try:
+            answers.extend((partner.answer(held).frames, partner.past.frames) for _ in range(4))
+        except Exception as error:
+            wrong.append(error)
+
+    threads = [threading.Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong and len(answers) == 16 and {frames for frames, _ in answers} == {4}
+
+
+def test_partners_in_threads_answer_as_one_after_another(model, duet):
+    def answers(seed: int) -> torch.Tensor:
+        partner = Partner(model, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(seed))
+        return torch.cat([partner.answer(duet.slice(t, t + 4)).body_rot for t in range(16, 32, 4)], dim=1)
+
+    wanted, got = {seed: answers(seed) for seed in range(3)}, {}
+    threads = [threading.Thread(target=lambda seed=seed: got.update({seed: answers(seed)})) for seed in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(torch.equal(got[seed], wanted[seed]) for seed in range(3))
+
+
+@pytest.mark.parametrize("save", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_what_cannot_be_copied_says_what_to_keep_and_that_goes_on(model, duet, save, tmp_path):
+    partner = Model(model, FAST).partner(duet.slice(0, 16), agents=0)
+    partner.answer(duet.slice(16, 20))
+    with pytest.raises(TypeError, match=r"keep partner\.past, .* begin a new one from it, model\.partner"):
+        save(partner)
+    kept = magnet.read(partner.past.save(tmp_path / "past.npz"))
+    assert Model(model, FAST).partner(kept, agents=0).answer(duet.slice(20, 24)).frames == 4
+
+
+def jumping(scene: Scene, first: int, metres: float = 50.0) -> Scene:
+    """Everybody is elsewhere from a frame on."""
+    moved = scene.T_world_root.clone()
+    moved[:, first:, :, 0, 3] += metres
+    return scene.replace(T_world_root=moved)
+
+
+def test_a_jump_in_the_past_is_refused_where_it_is_read(model, duet):
+    """Of people who are answered, in the whole tokens that are used."""
+    with pytest.raises(ValueError, match=r"^past: agent 1 moves \d+\.\d m to frame 6, expected .* past\.slice\(6\)$"):
+        Partner(model, jumping(duet, 6).slice(0, 18), (0,), FAST)
+    Partner(model, jumping(duet, 6).slice(6, 18), (0,), FAST)
+    Partner(model, jumping(duet, 2).slice(0, 18), (0,), FAST)
+    moved = duet.T_world_root.clone()
+    moved[:, 6:, 0, 0, 3] += 5.0
+    Partner(model, duet.replace(T_world_root=moved).slice(0, 16), (0,), FAST)
+
+
+def test_who_comes_back_elsewhere_after_a_loss_is_led_there_as_the_message_says(model, duet):
+    partner = Partner(model, duet.slice(0, 16), (0,), FAST)
+    partner.answer(duet.slice(15, 16).pad_frames(2).slice(0, 4))
+    coming, held = jumping(duet, 0, 1.5), partner.past
+    with pytest.raises(ValueError, match=r"keep held = partner\.past and .*bridged\(held, frames, 32, since\)"):
+        partner.answer(coming.slice(16, 20))
+    for since in range(0, 32, 4):
+        partner.answer(bridged(held, coming.slice(16 + since, 20 + since), 32, since))
+    last = partner.answer(coming.slice(48, 52))
+    assert torch.equal(last.T_world_root[:, :, 1], coming.T_world_root[:, 48:52, 1])
+
+
+def test_given_frames_that_are_not_valid_are_refused(model, duet):
+    valid = torch.ones(1, duet.frames, dtype=torch.bool)
+    marked = duet.replace(valid=valid)
+    Partner(model, marked.slice(0, 16), (0,), FAST).answer(marked.slice(16, 20))
+    valid[:, [0, 7, 17]] = False
+    with pytest.raises(ValueError, match=r"^past: frame 7 of scene 0 is not valid: begin from"):
+        Partner(model, marked.slice(0, 18), (0,), FAST)
+    partner = Partner(model, marked.slice(8, 16), (0,), FAST)
+    with pytest.raises(ValueError, match=r"^frames: frame 1 of scene 0 is not valid: hold the last good pose"):
+        partner.answer(marked.slice(16, 20))
+    assert partner.answer(duet.slice(16, 20)).frames == 4
 
 
 def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet):
     """From the frame before as within the frames; of those who answer nothing is read."""
     partner = Partner(model, duet.slice(0, 16), (0,), FAST)
     for first in (16, 18):
-        moved = duet.T_world_root.clone()
-        moved[:, first:, :, 0, 3] += 50.0
-        with pytest.raises(ValueError, match=rf"agent 1 moves (49|50|51)\.\d m to frame {first - 16},"):
-            partner.answer(duet.replace(T_world_root=moved).slice(16, 20))
+        with pytest.raises(ValueError, match=rf"agent 1 moves (49|50|51)\.\d m to frame {first - 16},.*bridged\("):
+            partner.answer(jumping(duet, first).slice(16, 20))
     moved = duet.T_world_root.clone()
     moved[:, :, 0, 0, 3] += 50.0
     partner.answer(duet.replace(T_world_root=moved).slice(16, 20))
