@@ -332,14 +332,23 @@ def test_a_loaded_model_gives_a_partner(model, duet):
     assert torch.equal(one.T_world_root[:, :, 0], duet.T_world_root[:, 32:40, 0])
 
 
-def test_the_partner_in_the_docs_answers():
-    """As it stands there."""
+def test_the_partners_in_the_docs_answer():
+    """As they stand there: fed from a scene, and from a tracker, beginning with somebody alone."""
     page = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
     blocks = [part.split("```")[0] for part in page.split("```python\n")[1:]]
     told: dict[str, Any] = {}
-    exec(next(block for block in blocks if "partner.answer" in block), told)
-    assert told["answer"].frames == 4
+    first, tracker = (block for block in blocks if "partner.answer" in block)
+    exec(first, told)
+    assert told["answer"].frames == 4 and "past.slice(28)" not in first
     assert torch.equal(told["answer"].T_world_root[:, :, 1], told["coming"].T_world_root[:, :, 1])
+    told["model"] = Model(told["model"].denoiser, SamplerOptions(steps=1))
+    exec(tracker, told)
+    assert told["solo"].agents == 1 and told["trio"].agents == 3 and told["partner"].past.agents == 2
+    x = cat_time(told["answers"]).T_world_root[0, :, :, 0, 3]
+    seconds = (32 + torch.arange(len(x))) / 30
+    tracked = seconds < 199 / 72
+    assert len(x) > 50 and (x[:, 0] - 0.3 * seconds.sin())[tracked].abs().max() < 1e-3
+    assert (x[~tracked, 0] == x[~tracked, 0][0]).all() and (x[:, 1] != 0).all()
 
 
 @pytest.mark.slow
