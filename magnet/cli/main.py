@@ -13,6 +13,7 @@ from types import FrameType
 
 from magnet.cli import predict_files
 from magnet.cli.errors import CommandError, explain, no_such
+from magnet.cli.pipes import CLOSED, output_closed
 from magnet.errors import Stopped
 from magnet.version import __version__
 
@@ -62,7 +63,22 @@ for example:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line; `sys.argv` by default. Returns the exit code: 0, or 2 where the user can put it right."""
+    """Run a command line; `sys.argv` by default.
+
+    Returns the exit code: 0, 2 where the user can put it right, or 141 where its output was closed before the end.
+    """
+    try:
+        code = answered(arguments)
+        print(end="", flush=True)  # here, for what fails once Python ends is told with a traceback
+    except BrokenPipeError:  # it may as well be another process's connection
+        if not output_closed():
+            raise
+        return CLOSED
+    return code
+
+
+def answered(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line, and say in a line what the user can put right. Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
     arguments = [underscored(argument) for argument in arguments if argument != "--debug"]
@@ -76,10 +92,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with ended_by_sigterm(arguments[0]):
             return run(arguments[0], arguments[1:])
     except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # rich ends the program where its output is closed
+            return CLOSED
         return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
     except KeyboardInterrupt:
         return complain("interrupted", 130)
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and output_closed():
+            return CLOSED
         message = explain(error)
         if debug or message is None:
             raise

@@ -28,15 +28,32 @@ WIDE = 100
 
 
 def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bool = False) -> None:
-    """Print the table; write all of it as JSON and CSV, with how it came about.
+    """Write a table as `write_results` does, then print it as `print_results` does: printing may fail."""
+    write_results(results, folder, facts)
+    print_results(results, folder, full)
+
+
+def write_results(results: Results, folder: Path, facts: dict[str, Any]) -> None:
+    """Write all of a table as JSON and CSV, with how it came about.
 
     Args:
         results: of a run that is finished.
         folder: to write to.
         facts: more of how it came about.
-        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
     """
     results.meta.update(provenance() | {"machine": machine()} | facts)
+    results.save_json(folder / "results.json")
+    results.save_csv(folder / "results.csv")
+
+
+def print_results(results: Results, folder: Path, full: bool = False) -> None:
+    """Print a table, and where it was written.
+
+    Args:
+        results: of a run that is finished.
+        folder: where all of it is.
+        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
+    """
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     shown = (
@@ -45,8 +62,6 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
     print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
     if "sampling" in results.meta:
         print(cost(results.meta["sampling"]))
-    results.save_json(folder / "results.json")
-    results.save_csv(folder / "results.csv")
     more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"
     print(f"written: {folder / 'results.json'} and .csv{more}")
 
@@ -60,15 +75,15 @@ def cost(stats: dict[str, float]) -> str:
 def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
     """Print and write what a module without an evaluation of its own has logged."""
     values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
-    table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
-    for name, value in values.items():
-        table.add_row(name, f"{value:.6g}")
-    Console().print(table)
     folder.mkdir(parents=True, exist_ok=True)
     plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
     (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n")
     lines = ["metric,value", *(f"{name},{value!r}" for name, value in values.items())]
     (folder / "results.csv").write_text("\n".join(lines) + "\n")
+    table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
+    for name, value in values.items():
+        table.add_row(name, f"{value:.6g}")
+    Console().print(table)
     print(f"written: {folder / 'results.json'} and .csv")
 
 
@@ -83,7 +98,7 @@ def write_scenes(
     from magnet.export.video import render_video
 
     rank = f"{evaluator.global_rank}-" if evaluator.trainer.world_size > 1 else ""
-    number = 0
+    number, pictured = 0, []
     for batch in predicted:
         for first in range(0, batch.scenes, evaluator.samples):
             scene = batch.select(slice(first, first + evaluator.samples)).to("cpu")
@@ -92,11 +107,13 @@ def write_scenes(
             if picture != "none" and number < pictures and evaluator.global_rank == 0:
                 shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
                 look = {"context_frames": data.test.context_frames, "body": data.body.to("cpu")}
-                print("written:", render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
-                print("written:", contact_sheet(shown, folder / f"{name}.png", **look))
+                pictured.append(render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
+                pictured.append(contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
     facts = evaluator.facts() | provenance() | {"machine": machine()}
     (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
+    for path in pictured:
+        print("written:", path)
     print(cost(facts["sampling"]))
     print(f"written: {number} scenes of {evaluator.samples} samples to {folder / 'scenes'}")
 

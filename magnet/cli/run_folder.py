@@ -24,6 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.errors import CommandError
+from magnet.cli.pipes import output_closed
 from magnet.cli.provenance import provenance
 from magnet.version import __version__
 
@@ -187,7 +188,12 @@ class ProgressLines(ProgressBar):
         self.said, left = now, ""
         if self.begun is not None and done > self.begun[1] and total != float("inf"):
             left = f", {clock((now - self.begun[0]) * (total - done) / (done - self.begun[1]))} left"
-        print(f"{what} {done}/{total:g}{left}{more}", flush=True)
+        try:
+            print(f"{what} {done}/{total:g}{left}{more}", flush=True)
+        except BrokenPipeError:
+            if not output_closed():
+                raise
+            self.disable()  # nobody reads on, and the run is worth more than its lines
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._start()

@@ -107,5 +107,8 @@ def show(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataModule
     from magnet.cli import outputs
     from magnet.evaluation.submission import score
 
-    for task, results in score(benchmark, data, handed, not given.no_baselines, given.seed).items():
-        outputs.show_results(results, given.out / task, {}, given.full)
+    tables = score(benchmark, data, handed, not given.no_baselines, given.seed)
+    for task, results in tables.items():  # all of them before the first is printed, which may fail
+        outputs.write_results(results, given.out / task, {})
+    for task, results in tables.items():
+        outputs.print_results(results, given.out / task, given.full)

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from magnet import cli
+from magnet.cli import outputs, score
+from magnet.evaluation import submission
+from magnet.evaluation.results import Results
 
 
 @pytest.mark.parametrize(
@@ -29,3 +32,18 @@ def test_what_cannot_be_scored_is_said_in_a_line(
     error = capsys.readouterr().err
     assert said in error
     assert "Traceback" not in error
+
+
+def test_the_tables_of_all_tasks_are_written_before_one_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = {task: Results({"mine": {"fd": 1.0}}) for task in ("joint_future", "motion_control")}
+    monkeypatch.setattr(submission, "score", lambda *words: tables)
+
+    def closed(*words: object, **more: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(outputs, "print_table", closed)
+    with pytest.raises(BrokenPipeError):
+        score.show(score.parser().parse_args(["--out", str(tmp_path)]), None, None, [])
+    assert all((tmp_path / task / "results.json").exists() for task in tables)

@@ -1,0 +1,30 @@
+"""What becomes of a command whose output nobody reads any more, such as behind `| head`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import sys
+
+CLOSED = 141
+"""The exit code of a command that stopped because its output was closed: 128 + SIGPIPE."""
+
+
+def output_closed() -> bool:
+    """Whether stdout or stderr leads into a pipe that nobody reads; what is written there from now on is dropped."""
+    return any([_dropped(stream) for stream in (sys.stdout, sys.stderr)])
+
+
+def _dropped(stream: object) -> bool:
+    # A stream may be none, or no file of the system, as in a notebook; and Windows cannot poll.
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        number = stream.fileno()  # type: ignore[attr-defined]
+        poll = select.poll()
+        poll.register(number, 0)
+        if any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, number)
+            os.close(nowhere)
+            return True
+    return False

@@ -1,0 +1,77 @@
+"""A command whose output nobody reads ends quietly, and what it was to write is there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnet.cli import run_folder
+from magnet.cli.pipes import CLOSED, output_closed
+
+ROOT = Path(__file__).parents[2]
+SHOWS = """
+import importlib, sys
+from pathlib import Path
+from magnet.cli import outputs
+from magnet.evaluation.results import Results
+main = importlib.import_module("magnet.cli.main")
+main.run = lambda *words: outputs.show_results(Results({"mine": {"fd": 1.0}}), Path("out"), {}) or 0
+sys.exit(main.main(["score"]))
+"""
+LOST = """
+import importlib, sys
+main = importlib.import_module("magnet.cli.main")
+def run(*words):
+    raise BrokenPipeError(32, "Broken pipe")
+main.run = run
+sys.exit(main.main(["agent"]))
+"""
+
+
+def unread(folder: Path, *words: str, both: bool = False) -> tuple[int, str]:
+    """Run Python with a stdout, or both outputs, that nobody reads. Returns the exit code and stderr."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    streams = {"stdout": writes, "stderr": writes if both else subprocess.PIPE}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *words], cwd=folder, env=environment, text=True, timeout=120, **streams)
+    os.close(writes)
+    return done.returncode, done.stderr or ""
+
+
+@pytest.mark.parametrize("words", [("--help",), ("--version",), ("tasks",), ("score", "--help")])
+def test_a_closed_pipe_ends_a_command_quietly(words: tuple[str, ...], tmp_path: Path) -> None:
+    code, said = unread(tmp_path, "-m", "magnet", *words)
+    assert said == ""
+    assert code in (CLOSED, 0) if "score" in words else code == CLOSED  # argparse drops help that it cannot write
+
+
+def test_a_mistake_that_nobody_reads_of_ends_quietly_too(tmp_path: Path) -> None:
+    assert unread(tmp_path, "-m", "magnet", "tset", both=True) == (CLOSED, "")
+
+
+def test_a_table_is_written_before_it_is_printed(tmp_path: Path) -> None:
+    assert unread(tmp_path, "-c", SHOWS) == (CLOSED, "")
+    assert (tmp_path / "out" / "results.json").exists() and (tmp_path / "out" / "results.csv").exists()
+
+
+def test_another_broken_pipe_is_an_error(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", LOST], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert "Broken pipe" in done.stderr
+
+
+def test_a_run_goes_on_where_nobody_reads_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    with os.fdopen(writes, "w") as unread_output:
+        monkeypatch.setattr(sys, "stdout", unread_output)
+        lines = run_folder.ProgressLines(seconds=0.0)
+        for done in (1, 2, 3):
+            lines.tell("test: denoising step", done, 3)
+        print("the table", flush=True)
+        assert not output_closed()  # it leads nowhere now
