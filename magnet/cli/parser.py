@@ -153,7 +153,7 @@ class Parser(LightningArgumentParser):
                     action.metavar, action.help = "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"])
 
     def explain(self, key: str, value: str, text: str) -> None:
-        """Set the help of an option that is a group of others."""
+        """Set the help of an option that Lightning or the parser has made."""
         for action in self._actions:
             if action.option_strings == [f"--{key}"]:
                 action.metavar, action.help = value, text

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from magnet.cli import checkpoint_config, class_options, config_files, going_on,
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
+from magnet.cli.flags import valued
 from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
 from magnet.datamodules import registry
 
@@ -93,6 +96,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     folder = run_folder.run_folder(runs / name, out)
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
+    files = [*files, *seed_of_samples(files, words)] if command in SAMPLING else files
     settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
     require_data(settled.classes.get("data"))
     for note in settled.notes:
@@ -145,6 +149,21 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         return checkpoint_config.find_checkpoint(name, [Path(out) if out else runs / run])
     folders = [Path(out or runs), runs / run, runs]
     return checkpoint_config.find_checkpoint(name, folders)
+
+
+def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:
+    """`seed` as a layer, where what is said last of seeds is `seed_everything` alone, for samples follow `seed`.
+
+    Args:
+        files: what the user's files say, lowest first.
+        flags: the command line, which beats them.
+    """
+    said = [{name.removeprefix("--"): value for name, value in valued(flags)}]
+    said += [layer.options for layer in reversed(files)]
+    last = next((options for options in said if {"seed", "seed_everything"} & options.keys()), {})
+    value = last.get("seed_everything")
+    whole = re.fullmatch(r"\d+", str(value)) is not None  # of anything else the parser and Lightning make what they can
+    return [Layer("", {"seed": int(str(value))})] if whole and "seed" not in last else []
 
 
 def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:

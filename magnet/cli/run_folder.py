@@ -267,7 +267,8 @@ def clock(seconds: float) -> str:
 def seeds(options: dict[str, Any]) -> dict[str, Any]:
     """What a run's randomness follows from, for its record: the main seed, and every one by the option that sets it.
 
-    Samples follow from `seed`, where a command has it, batches from `data.seed`, noise in training from `model.seed`.
+    Samples follow from `seed`, where a command has it (`request.seed_of_samples`), batches from `data.seed`, noise in
+    training from `model.seed`.
     """
     found = {name: options.get(name) for name in ("seed", "seed_everything")}
     for part in ("model", "data"):

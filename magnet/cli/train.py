@@ -44,6 +44,13 @@ MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.m
 """Models with short names, and where they are; the first one is the default."""
 
 SEED = 1111
+EVERYTHING = {
+    "fit": "seed of new weights and of what has no seed of its own; batches follow data.seed, noise model.seed",
+    "validate": "seed of what has no seed of its own; noise follows model.seed",
+    "test": "seed of what has no seed of its own, and of samples where --seed is not said",
+    "predict": "seed of what has no seed of its own, and of samples where --seed is not said",
+}
+"""What --seed_everything says in place of Lightning's text."""
 SILENCED = (
     ".*does not have many workers.*",
     ".*LeafSpec.*",
@@ -180,6 +187,7 @@ class MagnetCLI(LightningCLI):
         parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.request.classes
         parser.layers, parser.topic = self.request.layers, self.request.topic
         self._default_class(parser, "data", registry.default_path())
+        parser.explain("seed_everything", "N", EVERYTHING[self.command])
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
         parser.add_argument(
             "--wandb",

@@ -199,6 +199,30 @@ def test_a_run_records_the_seeds_that_it_used(sampling: Path, toy: Path) -> None
     assert facts["seeds"] == {"seed": 5, "seed_everything": 6}  # neither the toy nor its data have one of their own
 
 
+@pytest.mark.parametrize(
+    ("words", "seed"),
+    [
+        (("--seed_everything", "6"), 6),
+        (("--seed_everything=6", "--config", "seven.yaml"), 6),  # a flag beats a file
+        (("--config", "seven.yaml", "--config", "eight.yaml"), 8),
+        (("--config", "eight.yaml", "--config", "seven.yaml"), 7),
+        (("--config", "eight.yaml", "--seed", "5"), 5),
+        (("--seed_everything", "false"), 1111),
+        ((), 1111),
+    ],
+)
+@pytest.mark.parametrize("command", ["test", "predict"])
+def test_samples_follow_the_seed_that_was_said_last(
+    sampling: Path, toy: Path, command: str, words: tuple[str, ...], seed: int
+) -> None:
+    (toy / "seven.yaml").write_text("seed: 7\nseed_everything: 70\n")
+    (toy / "eight.yaml").write_text("seed_everything: 8\n")
+    go(command, "--ckpt_path", "trained/checkpoints/last.ckpt", "--samples", "2", *words, "--out", "made")
+    facts = json.loads((toy / "made" / "run.json").read_text())
+    assert facts["seed"] == facts["seeds"]["seed"] == ToyModel.seen["evaluator"].seed == seed
+    assert yaml.safe_load((toy / "made" / "config.yaml").read_text())["seed"] == seed
+
+
 def test_seeds_of_model_and_data_are_recorded_by_their_names() -> None:
     of = {"class_path": "its.Class", "init_args": {"seed": 3}}
     fit = run_folder.seeds({"seed_everything": 1111, "model": of, "data": {"class_path": "its.Data"}})
