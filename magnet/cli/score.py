@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -105,8 +106,10 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
 def show(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataModule, handed: list) -> None:
     """Measure, print and write a table for each task."""
     from magnet.cli import outputs
-    from magnet.evaluation.submission import score
+    from magnet.evaluation.submission import doubted, score
 
+    for said in doubted(benchmark, data, handed):
+        print(f"magnet: {said}", file=sys.stderr)
     tables = score(benchmark, data, handed, not given.no_baselines, given.seed)
     for task, results in tables.items():  # all of them before the first is printed, which may fail
         outputs.write_results(results, given.out / task, {})

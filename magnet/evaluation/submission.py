@@ -15,6 +15,7 @@ from torch import Tensor
 from magnet.baselines.predictor import Generators, Predictor
 from magnet.datamodules.base import MotionDataModule
 from magnet.evaluation.benchmark import Benchmark
+from magnet.evaluation.plausible import doubts, require_people
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import TRAINING, TRUTH, UNALIGNED, Scoring, generators_of
 from magnet.files import load_npz, writing
@@ -95,6 +96,7 @@ class Submission:
         _require_facts(path, read, benchmark)
         _require_scenes(path, names, benchmark.scenes)
         joints = _joints(path, read["joints"], benchmark, str(read["task"]))
+        require_people(str(path), joints, benchmark.sight(str(read["task"])).generated)
         method = str(read["method"]).strip() or path.stem
         return Submission(str(read["benchmark"]), str(read["task"]), method, names, joints, path.name)
 
@@ -176,6 +178,18 @@ def answered(
         joints.append(method(batch, samples, generators_of(seed, numbers, samples)).transpose(0, 1).cpu())
         names += batch.names or ()
     return names, torch.cat(joints)
+
+
+def doubted(benchmark: Benchmark, datamodule: MotionDataModule, submissions: Sequence[Submission]) -> list[str]:
+    """What is unlikely of submissions beside the recorded scenes, a line each: lengths, places, the order of people."""
+    scenes = list(datamodule.test_dataloader())
+    recorded = torch.cat([datamodule.body.joints(batch) for batch in scenes])
+    said = []
+    for each in submissions:
+        joints = torch.cat([each.answer(batch, each.samples, []).transpose(0, 1) for batch in scenes])
+        told = doubts(joints, recorded, benchmark.context_frames, benchmark.sight(each.task), benchmark.fps)
+        said += [f"{each.file or each.method}: {text}" for text in told]
+    return said
 
 
 def score(

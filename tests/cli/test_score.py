@@ -35,10 +35,11 @@ def test_what_cannot_be_scored_is_said_in_a_line(
 
 
 def test_the_tables_of_all_tasks_are_written_before_one_is_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     tables = {task: Results({"mine": {"fd": 1.0}}) for task in ("joint_future", "motion_control")}
     monkeypatch.setattr(submission, "score", lambda *words: tables)
+    monkeypatch.setattr(submission, "doubted", lambda *words: ["a.npz: legs are 3 m long"])
 
     def closed(*words: object, **more: object) -> None:
         raise BrokenPipeError
@@ -46,4 +47,5 @@ def test_the_tables_of_all_tasks_are_written_before_one_is_printed(
     monkeypatch.setattr(outputs, "print_table", closed)
     with pytest.raises(BrokenPipeError):
         score.show(score.parser().parse_args(["--out", str(tmp_path)]), None, None, [])
+    assert capsys.readouterr().err == "magnet: a.npz: legs are 3 m long\n"
     assert all((tmp_path / task / "results.json").exists() for task in tables)
