@@ -27,7 +27,7 @@ def frechet_distance(mu1: Tensor, s1: Tensor, mu2: Tensor, s2: Tensor, jitter: f
     """|mu1 - mu2|^2 + tr(s1 + s2 - 2 (s1^.5 s2 s1^.5)^.5) of two Gaussians. (D,), (D, D) x 2 -> scalar
 
     `jitter * (tr s + 1)` is added to each covariance's diagonal, so that fewer frames than dimensions do
-    no harm; roots by eigenvalues, the negative ones of rounding taken as 0.
+    no harm; roots by eigenvalues. Negative eigenvalues, and a negative distance, are rounding and taken as 0.
 
     >>> mean, spread = torch.zeros(3), torch.eye(3)
     >>> frechet_distance(mean, spread, mean + 2, spread).round(decimals=3)  # apart by 2 in each of 3 directions
@@ -39,7 +39,7 @@ def frechet_distance(mu1: Tensor, s1: Tensor, mu2: Tensor, s2: Tensor, jitter: f
     root = (vectors * values.clamp(min=0).sqrt()) @ vectors.T
     cross = root @ s2 @ root
     overlap = torch.linalg.eigvalsh((cross + cross.T) / 2).clamp(min=0).sqrt().sum()
-    return ((mu1 - mu2) ** 2).sum() + s1.trace() + s2.trace() - 2 * overlap
+    return (((mu1 - mu2) ** 2).sum() + s1.trace() + s2.trace() - 2 * overlap).clamp(min=0)
 
 
 def moments(count: Tensor, total: Tensor, outer: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,7 +155,7 @@ class FrechetBySecond(FrechetDistance):
     >>> truth = standing_people(frames=60, agents=2)  # (1, 60, 2, 22, 3), a metre apart one behind the other
     >>> metric = FrechetBySecond("pair")
     >>> metric.update(truth[None], truth)
-    >>> [abs(round(metric.compute()[name].item(), 3)) for name in ("fd_pair@second1", "fd_pair@second2")]
+    >>> [round(metric.compute()[name].item(), 3) for name in ("fd_pair@second1", "fd_pair@second2")]
     [0.0, 0.0]
     """
 

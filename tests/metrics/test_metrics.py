@@ -235,7 +235,14 @@ def test_a_shift_of_one_metre_costs_what_arithmetic_says() -> None:
 def test_frechet_distance_of_a_set_to_its_own_repeats_is_small_and_never_negative() -> None:
     _, truth, present = draw_batch(scenes=8, frames=60)
     got = result(FrechetDistance(), truth[None].repeat(3, 1, 1, 1, 1, 1), truth, present)["fd"]
-    assert -1e-9 < got < 1e-3
+    assert 0 <= got < 1e-3
+
+
+def test_no_distance_of_equal_gaussians_is_negative() -> None:
+    draw = torch.Generator().manual_seed(0)
+    features = 10 * torch.randn(20, 300, 63, generator=draw, dtype=torch.float64)
+    found = [frechet_distance(*[each.mean(dim=0), each.T.cov()] * 2) for each in features]
+    assert all(0 <= distance < 1e-6 for distance in found)
 
 
 def test_frechet_distance_between_two_gaussians_in_closed_form() -> None:
