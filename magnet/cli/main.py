@@ -32,6 +32,7 @@ LIGHT_COMMANDS = {
     "view": "watch scenes in the browser, or let a model play live",
     "refine": "move people of a scene out of each other's bodies",
     "score": "measure submissions to the open benchmark, of any method",
+    "compare": "two results of a test, scene by scene: which is better, and whether that is sure",
     "report": "the paper's tables, run here beside the printed numbers",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
     "export-model": "write a model as ONNX files, for programs without torch",

@@ -23,6 +23,9 @@ PANELS = 4
 """Samples that a moving picture shows side by side."""
 
 
+FACTS = ("task", "benchmark", "checkpoint", "samples", "seed", "context frames", "horizon frames")
+"""What scenes.json, too, says of a run."""
+
 WIDE = 100
 """Columns that a table may have where it is written to no screen."""
 
@@ -34,7 +37,7 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
 
 
 def write_results(results: Results, folder: Path, facts: dict[str, Any]) -> None:
-    """Write all of a table as JSON and CSV, with how it came about.
+    """Write all of a table as JSON and CSV, with how it came about, and what each scene measured (scenes.json).
 
     Args:
         results: of a run that is finished.
@@ -44,6 +47,9 @@ def write_results(results: Results, folder: Path, facts: dict[str, Any]) -> None
     results.meta.update(provenance() | {"machine": machine()} | facts)
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
+    if results.scenes is not None:
+        told = {key: results.meta[key] for key in FACTS if key in results.meta}
+        replace(results.scenes, facts=told).save(folder / "scenes.json")
 
 
 def print_results(results: Results, folder: Path, full: bool = False) -> None:
@@ -63,7 +69,8 @@ def print_results(results: Results, folder: Path, full: bool = False) -> None:
     if "sampling" in results.meta:
         print(cost(results.meta["sampling"]))
     more = "" if full else f"; all {len(results.metrics)} numbers of all methods are there, and printed with --full"
-    print(f"written: {folder / 'results.json'} and .csv{more}")
+    scenes = "" if results.scenes is None else ", and each scene's numbers in scenes.json"
+    print(f"written: {folder / 'results.json'} and .csv{scenes}{more}")
 
 
 def cost(stats: dict[str, float]) -> str:

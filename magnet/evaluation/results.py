@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from magnet.evaluation.by_scene import SceneValues
 from magnet.metrics import Better, Column, all_metrics, column, columns_of
 from magnet.metrics.columns import part_notes
 
@@ -47,11 +48,13 @@ class Results:
         rows: method -> metric -> value; `<metric>_low` and `<metric>_high` beside it are its interval.
         meta: facts about the run, JSON-ready: command, commit, machine, date, seed, data, task, sampler, runtime.
         columns: how metrics are shown, by `columns_of`; those of this package's metrics need not be given.
+        scenes: what each test scene measured; in a file of its own (`SceneValues.save`).
     """
 
     rows: dict[str, dict[str, float]]
     meta: dict[str, Any] = field(default_factory=dict)
     columns: dict[str, Column] = field(default_factory=dict)
+    scenes: SceneValues | None = field(default=None, compare=False)
 
     @property
     def metrics(self) -> list[str]:
@@ -144,7 +147,7 @@ class Results:
     def to_markdown(self, metrics: Sequence[str] | None = None, intervals: bool = False) -> str:
         """The table in markdown, with its footnotes."""
         chosen = self.chosen(metrics)
-        lines = ["| method | " + " | ".join(self._title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
+        lines = ["| method | " + " | ".join(self.title(m) for m in chosen) + " |", "|---|" + "---:|" * len(chosen)]
         best = {metric: self.best(metric) for metric in chosen}
         for method in self.rows:
             cells = []
@@ -167,7 +170,8 @@ class Results:
         main = [m for m in measured if self.column(m).main]
         return [m for m in FIRST if m in main] + [m for m in main if m not in FIRST] or measured
 
-    def _title(self, metric: str) -> str:
+    def title(self, metric: str) -> str:
+        """A metric's name in a table, and an arrow to what is good."""
         shown = self.column(metric)
         return shown.title + ARROWS[shown.better]
 
@@ -238,7 +242,7 @@ def _table(results: Results, metrics: list[str], best: dict[str, set[str]], inte
 
 def _in_two_lines(results: Results, metric: str) -> str:
     """A title of several words, cut at the space nearest to its middle."""
-    title = results._title(metric)
+    title = results.title(metric)
     spaces = [at for at, letter in enumerate(results.column(metric).title) if letter == " "]
     if not spaces:
         return title

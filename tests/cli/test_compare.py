@@ -1,0 +1,80 @@
+"""`magnet compare`: two results, scene by scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnet import cli
+from magnet.cli import outputs
+from magnet.evaluation.by_scene import SceneValues
+from magnet.evaluation.results import Results
+
+
+def results_in(folder: Path, worse: float = 0.0, scenes: int = 12, first: int = 0, **facts: object) -> Path:
+    """The results of a test whose MPJPE is so much worse than chance; NN has half a metre more."""
+    error = np.random.default_rng(0).uniform(0.2, 0.8, size=first + scenes)[first:] + worse
+    rows = {}
+    for name, values in {"magnet": error, "NN": error + 0.5}.items():
+        rows[name] = {metric: np.stack([values, np.full(scenes, 3.0)], axis=1) for metric in ("mpjpe@1s", "mpjve")}
+    names = tuple(f"take [{n}:{n + 1}]" for n in range(first, first + scenes))
+    means = {name: {metric: float(each[:, 0].mean()) for metric, each in row.items()} for name, row in rows.items()}
+    results = Results(means, {"task": "joint_future", "samples": 10, **facts})
+    outputs.write_results(
+        Results(results.rows, results.meta, {}, SceneValues(names, tuple(range(scenes)), rows)), folder, {}
+    )
+    return folder
+
+
+def said(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    assert cli.main(["compare", *map(str, words)]) == 0
+    return capsys.readouterr().out
+
+
+def test_two_results_are_compared_over_their_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = results_in(tmp_path / "a", 0.1), results_in(tmp_path / "b")
+    text = said(capsys, one, other)
+    assert "magnet (A) and magnet (B), 12 scenes of both (12 independent)" in text
+    (line,) = [line.split() for line in text.splitlines() if "MPJPE" in line]
+    assert line[-5:] == ["-0.100", "[-0.100,", "-0.100]", "magnet", "(B)"]
+    assert "MPJVE" not in text and "MPJVE" in said(capsys, one, other, "--full")
+    assert "not alike" not in text
+    assert "cannot be told" in said(capsys, one, one / "scenes.json")
+
+
+def test_two_rows_of_one_result_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = said(capsys, results_in(tmp_path / "a"), "--rows", "NN", "magnet")
+    (line,) = [line.split() for line in text.splitlines() if "MPJPE" in line]
+    assert line[-4:] == ["-0.500", "[-0.500,", "-0.500]", "magnet"]
+
+
+def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = results_in(tmp_path / "a", samples={"magnet": 1})
+    text = said(capsys, one, results_in(tmp_path / "b", first=2, task="generation"))
+    assert "10 scenes of both" in text
+    assert "2 scenes are in one of them alone" in text
+    assert "not alike: task, joint_future and generation" in text
+    assert "not alike: samples, 1 and 10" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a"], "got 1 folders, expected two, or one with --rows ROW ROW"),
+        (["a", "nowhere"], "nowhere: has no results.json, expected a folder that magnet test or"),
+        (["a", "old"], "old: has no scenes.json"),
+        (["a", "--rows", "magnet", "nn"], "no row nn; there are magnet, NN. See a"),
+        (["a", "far"], "no common test scenes: one has take [0:1], the other take [50:51]"),
+    ],
+)
+def test_what_cannot_be_compared_is_said_in_a_line(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    results_in(Path("a")), results_in(Path("far"), first=50), results_in(Path("old"))
+    Path("old/scenes.json").unlink()
+    assert cli.main(["compare", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
