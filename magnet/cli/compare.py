@@ -122,7 +122,7 @@ def show(
     ]
     for note in [
         *notes,
-        "intervals hold 95 % of resampled scenes, the same ones for both; with under ten they are too narrow",
+        "an interval is of independent scenes, resampled for both alike; with under ten of them it is too narrow",
     ]:
         console.print(note, style="dim")
 
