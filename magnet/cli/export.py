@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code."""
-    options = parser().parse_args(list(arguments))
+    options = parser().parse_intermixed_args(list(arguments))
     from magnet.body import on_floor
     from magnet.export import formats
     from magnet.export.bones import BoneOptions

@@ -103,7 +103,7 @@ def main(arguments: Sequence[str]) -> int:
     for name in ("task", "sampler"):
         taken, words = taken_out(words, rf"--{name}\.")
         groups[name] = list(itertools.chain.from_iterable(taken))
-    options = parser().parse_args(words)
+    options = parser().parse_intermixed_args(words)
     for path in options.inputs:
         if Path(path).suffix.lower() in READ and not Path(path).exists():  # before anything else is asked for
             raise CommandError(f"{path}: no such file")

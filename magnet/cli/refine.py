@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code."""
-    options = parser().parse_args(list(arguments))
+    options = parser().parse_intermixed_args(list(arguments))
     from dataclasses import replace
     from pathlib import Path
 

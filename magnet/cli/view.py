@@ -64,7 +64,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
     add("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
     add("--no_browser", action="store_true", help="only say where it is")
-    return parser.parse_args(words)
+    return parser.parse_intermixed_args(words)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -51,6 +51,28 @@ def test_files_that_are_read_are_not_written_over_unless_they_are_named(
     assert before == [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "take_0.bvh", "--fps", "30", "take_1.bvh", "o.csv"],
+        ["export", "take_0.bvh", "take_1.bvh", "--trim", "o.csv"],
+        ["refine", "take_0.bvh", "take_1.bvh", "--keep", "0", "--poses", "keep", "o.npz"],
+        ["predict", "take_0.bvh", "--trim", "take_1.bvh", "--out", "o.npz", "--frames", "4", "--sampler.steps", "1"],
+        ["view", "take_0.bvh", "--style", "light", "take_1.bvh", "--html", "o.html"],
+    ],
+    ids=lambda words: " ".join(words[:3]),
+)
+def test_options_may_stand_between_files(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 0
+    out = next(word for word in words if word.startswith("o."))
+    assert f"written: {out}" in capsys.readouterr().out and Path(out).is_file()
+
+
+def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(capsys, "refine", "duet.npz", "--shapes", "duet.npz", "o.npz")
+    assert "files stand first, then options, for --shapes takes all words behind it" in said
+
+
 @pytest.mark.parametrize("command", ["refine", "export"])
 def test_one_person_takes_out_alone_whatever_the_input_is_called(
     command: str, folder: Path, capsys: pytest.CaptureFixture[str]
