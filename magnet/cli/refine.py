@@ -77,7 +77,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.plot:
         require_place(options.plot)
     got = scene_files.read_inputs(options, scene_files.reading(options))
-    scene_files.require_unread(out, options.inputs, got.scene.present.sum(dim=1).tolist())
+    read = [*options.inputs, *(options.shapes or ())]
+    scene_files.require_unread(out, read, got.scene.present.sum(dim=1).tolist())
     formats.require_finite(got.scene, "cut such frames out")
     if not got.scene.frames or not bool(got.scene.present.any()):
         what = "people" if got.scene.frames else "frames"

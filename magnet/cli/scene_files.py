@@ -103,7 +103,7 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 def require_unread(
     path: Path, inputs: Sequence[str], people: Sequence[int], smplx: bool = False, each: bool = False
 ) -> None:
-    """Refuse to write over an input that OUT does not name: people and scenes may get a file each.
+    """Refuse to write over an input, which may be somebody's only recording: OUT itself, or a file of OUT's people.
 
     Args:
         path: OUT.
@@ -118,13 +118,15 @@ def require_unread(
 
     read = [source for source in map(Path, inputs) if source.exists()]
     for file in formats.files_of(path, people, smplx, each):
-        named = file == path or (path.exists() and file.exists() and file.samefile(path))
-        for source in read if file.exists() and not named else ():
-            if file.samefile(source):
-                raise CommandError(
-                    f"{path}: people and scenes get a {path.suffix.lower()} each, and {source.name}, which is read, "
-                    "would be one of them; give OUT another name"
-                )
+        for source in read if file.exists() else ():
+            if not file.samefile(source):
+                continue
+            if file == path:
+                raise CommandError(f"{path}: is read, and would be written over; give OUT another name")
+            raise CommandError(
+                f"{path}: people and scenes get a {path.suffix.lower()} each, and {source.name}, which is read, "
+                "would be one of them; give OUT another name"
+            )
 
 
 def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:

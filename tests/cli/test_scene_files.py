@@ -42,7 +42,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 @pytest.mark.parametrize("command", ["refine", "export", "predict"])
-def test_files_that_are_read_are_not_written_over_unless_they_are_named(
+def test_files_that_are_read_are_not_written_over_by_those_of_people(
     command: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
@@ -107,12 +107,34 @@ def test_a_link_to_what_is_read_is_not_written_over(folder: Path, capsys: pytest
     assert "take_0.bvh, which is read" in refused(capsys, "refine", "take_0.bvh", "take_1.bvh", "linked.bvh")
 
 
-def test_a_file_that_is_named_may_be_written_over_and_a_numbered_npz_is_none_of_many(
-    folder: Path,
-) -> None:
+def test_a_numbered_npz_is_none_of_many(folder: Path) -> None:
     assert cli.main(["export", "duet.npz", "duet_0.npz"]) == 0
     assert cli.main(["export", "duet_0.npz", "duet.npz"]) == 0
-    assert cli.main(["export", "duet.npz", "duet.npz"]) == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "duet.npz", "duet.npz"],
+        ["export", "duet.npz", "linked.npz"],
+        ["export", "take_0.bvh", "./take_0.bvh"],
+        ["refine", "take_0.bvh", "take_0.bvh"],
+        ["refine", "duet.npz", "other.npz", "duet.npz"],
+        ["refine", "duet.npz", "other.npz", "--shapes", "other.npz"],
+        ["predict", "take_0.bvh", "--out", "take_0.bvh"],
+        ["predict", "duet.npz", "--out", "o.glb", "duet.npz"],
+    ],
+    ids=" ".join,
+)
+def test_what_is_read_is_not_written_over_though_it_is_named(
+    words: list[str], folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
+    random_scene(1, 12, 1, torch.Generator().manual_seed(1)).save("other.npz")
+    Path("linked.npz").symlink_to("duet.npz")
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert "is read, and would be written over; give OUT another name" in refused(capsys, *words)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
 @pytest.mark.parametrize(
