@@ -13,6 +13,7 @@ from magnet.cli.flags import PlainParser
 if TYPE_CHECKING:
     from magnet.export.drawing import Size
     from magnet.export.formats import Read, Reading
+    from magnet.motion.scene import Scene
 
 Options = argparse.ArgumentParser | argparse._ArgumentGroup
 
@@ -69,6 +70,8 @@ IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a sec
 """An option of commands that read files."""
 PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
 """An option that names a person, and may be repeated."""
+MOMENTS, SAME_PLACE = 30, 0.02
+"""Frames that are looked at, and metres between pelvises in all of them that no two bodies leave each other."""
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
@@ -133,17 +136,56 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
     """The scenes of all IN; what was noted on the way is printed.
 
     Raises:
-        CommandError: there are no scenes.
+        CommandError: there are no scenes, or a file is named twice.
         ValueError: files that cannot be read; says what to do.
     """
     from magnet.export import formats
 
+    require_each_once(options.inputs)
     got = formats.read(options.inputs, options.body, reading)
-    for note in got.notes:
+    for note in [*got.notes, *one_in_another(got.scene)]:
         print(note)
     if not got.scene.scenes:
         raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
     return got
+
+
+def require_each_once(inputs: Sequence[str]) -> None:
+    """Refuse one file for two people, whose bodies would be in each other.
+
+    Raises:
+        CommandError: names the file, and for whom it is named.
+    """
+    read: dict[tuple[int, int], int] = {}
+    for person, path in enumerate(map(Path, inputs)):
+        if not path.exists():
+            continue  # the reader says so
+        facts = path.stat()
+        before = read.setdefault((facts.st_dev, facts.st_ino), person)
+        if before != person:
+            raise CommandError(
+                f"{path}: is given as file {before + 1} and as file {person + 1}, which would be one body in the "
+                "other; give each person a file of their own"
+            )
+
+
+def one_in_another(scene: Scene) -> list[str]:
+    """Warnings of two people who are in the same place throughout, as where one recording was copied."""
+    import torch
+
+    from magnet.export.upright import WARNING
+
+    moments = scene.frames_at(torch.linspace(0, max(scene.frames - 1, 0), min(scene.frames, MOMENTS)).long())
+    pelvis = moments.T_world_root[..., :3, 3].float()  # (B, F, P, 3)
+    both = moments.present[:, :, None] & moments.present[:, None]
+    apart = torch.stack([(pelvis - pelvis[:, :, [p]]).norm(dim=-1) for p in range(scene.agents)], dim=-1)
+    same = (apart < SAME_PLACE).all(dim=1) & both  # (B, P, P)
+    pairs = same.any(dim=0).triu(1).nonzero().tolist() if scene.frames else []
+    return [
+        f"{WARNING}people {one} and {other} are in the same place throughout, one body in the other; is one recording "
+        "given twice?"
+        for one, other in pairs[:1]
+    ]
 
 
 def say_written(paths: Iterable[Path]) -> None:

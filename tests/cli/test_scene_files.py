@@ -68,6 +68,24 @@ def test_options_may_stand_between_files(words: list[str], folder: Path, capsys:
     assert f"written: {out}" in capsys.readouterr().out and Path(out).is_file()
 
 
+@pytest.mark.parametrize("command", ["export", "refine", "predict"])
+def test_one_file_is_not_two_people(
+    command: str, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
+    out = ["--out", "o.npz"] if command == "predict" else ["o.npz"]
+    said = refused(capsys, command, "take_0.bvh", "take_1.bvh", "./take_0.bvh", *out)
+    assert "take_0.bvh: is given as file 1 and as file 3" in said and not Path("o.npz").exists()
+
+
+def test_people_in_one_place_are_warned_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("copy.bvh").write_bytes(Path("take_1.bvh").read_bytes())
+    assert cli.main(["export", "take_0.bvh", "take_1.bvh", "copy.bvh", "o.npz"]) == 0
+    assert "warning: people 1 and 2 are in the same place throughout" in capsys.readouterr().out
+    assert cli.main(["export", "duet.npz", "take.csv"]) == 0
+    assert "warning" not in capsys.readouterr().out
+
+
 def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, "refine", "duet.npz", "--shapes", "duet.npz", "o.npz")
     assert "files stand first, then options, for --shapes takes all words behind it" in said
