@@ -86,7 +86,9 @@ class PlainParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)
         hint = closest(unknown[1].partition("=")[0], list(self._option_string_actions)) if unknown else ""
-        several = [action.option_strings[0] for action in self._actions if action.option_strings and action.nargs == "+"]
+        several = [
+            action.option_strings[0] for action in self._actions if action.option_strings and action.nargs == "+"
+        ]
         if message.endswith("required: OUT") and several:
             hint = f"; files stand first, then options, for {several[0]} takes all words behind it"
         print(refused(self.command, message + hint), file=sys.stderr)

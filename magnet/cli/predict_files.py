@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnet.cli import scene_files
+from magnet.cli import predict_written, scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import taken_out
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from magnet.cli.tasks import TaskChoice
     from magnet.motion.scene import Scene
     from magnet.sampling.options import SamplerOptions
+    from magnet.sampling.schedule import MaskSchedule
 
 CONTEXT = 32
 """Frames given of everybody where nothing is said and the task reads what comes later, as in its tests: a second."""
@@ -133,7 +134,11 @@ def main(arguments: Sequence[str]) -> int:
     model = Model(DenoiserCore.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
-    scene, context, frames = lengths(options, task, scene, added, model)
+    files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)
+    (files, lead), plan = predict_written.in_front(files, scene), plan_of(task, scene, context, frames, model)
+    unmade = ~plan.finished
+    for line in predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade):
+        print(line)
     began = time.perf_counter()
     made = model.predict(
         Motion.of(scene, body),
@@ -145,11 +150,11 @@ def main(arguments: Sequence[str]) -> int:
         **task.fields,
     )
     took = time.perf_counter() - began
-    seen = f", of which {made.scenes * made.context} are given," if made.context else ""
-    print(f"{task.name}: {made.scenes * made.frames} frames{seen} in {took:.1f} s, seed {options.seed}")
+    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead)
+    print(f"{task.name}: {count} frames{seen} in {took:.1f} s, seed {options.seed}")
     from magnet.export import formats
 
-    given, plain = made.context, made.plain()
+    given, plain = lead + made.context, predict_written.completed(made.plain(), files, lead, unmade)
     if plain.scenes > 1 and scene.scenes == 1:
         plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
     look: dict[str, Any] = {"style": options.style, "size": size, "context_frames": given}
@@ -306,12 +311,30 @@ def lengths(
                 f"{choice.name} reads motion of person {added[0]}, of whom no file tells; partner_inpainting adds "
                 "people to those that are there, generation makes everybody"
             )
-    known = schedule_of(choice.task, Grid(tokens, scene.agents, context // TOKEN_FRAMES, steps)).known
+    known = plan_of(choice, scene, context, rest, model).known
     if bool(known[context // TOKEN_FRAMES :].any()):
         return scene, context, rest if options.frames or recorded > context else FUTURE
-    if bool(known.any()):  # of generation nothing is
+    if bool(known.any()):
         scene, context = going_on(options, choice.name, scene, context, recorded)
+    else:  # as of generation, to which a context would be frames of nothing
+        context = 0
+        if options.inputs:
+            print(f"{choice.name} is given no motion: of the files only the number and shapes of people are read")
     return scene, context, options.frames or FUTURE
+
+
+def plan_of(choice: TaskChoice, scene: Scene, context: int, frames: int, model: Model) -> MaskSchedule:
+    """The task's plan for so many frames after the context: what it reads, and what it makes.
+
+    Raises:
+        ValueError: the task makes no sense at these sizes.
+    """
+    from magnet.motion.tokens import TOKEN_FRAMES
+    from magnet.sampling.grid import Grid
+    from magnet.tasks.base import schedule_of
+
+    tokens, past = -(-(context + frames) // TOKEN_FRAMES), context // TOKEN_FRAMES
+    return schedule_of(choice.task, Grid(tokens, scene.agents, past, model.sampler.steps))
 
 
 def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing: bool) -> int:
@@ -346,10 +369,8 @@ def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing:
 def going_on(options: argparse.Namespace, task: str, scene: Scene, context: int, recorded: int) -> tuple[Scene, int]:
     """What a task goes on from that reads nothing after its context: all of the files, unless --context says less."""
     if options.context is None and recorded:
-        if recorded < scene.frames:
-            print(f"the first {scene.frames - recorded} of {scene.frames} frames are left out, to have whole tokens")
         return scene.slice(scene.frames - recorded), recorded
     if scene.frames > context and options.inputs:
-        unread = f"{scene.frames - context} of {scene.frames} recorded frames come after it and are not used"
+        unread = f"{scene.frames - context} of {scene.frames} recorded frames come after it and are not read"
         print(f"--context {context}: {unread}; without it {task} goes on from the end")
     return scene, context

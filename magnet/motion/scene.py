@@ -56,7 +56,7 @@ class Scene:
     body: str = "open-1"  # id of the body model that `betas` belong to
     valid: Tensor | None = None  # (B, T) bool, False where a frame is padding or was masked; None: all good
     names: tuple[str, ...] = ()  # one label a scene, for reports
-    given: Tensor | None = None  # (B, T, P) bool, frames that a model was given and did not make; None: unsaid
+    given: Tensor | None = None  # (B, T, P) bool, frames that no model made, as what it was given; None: unsaid
 
     def __post_init__(self) -> None:
         for field in TENSORS:

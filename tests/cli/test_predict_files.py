@@ -45,10 +45,10 @@ def test_every_task_goes_from_files_to_a_file(task, duet, tmp_path, capsys) -> N
     out = tmp_path / "out.npz"
     said(capsys, *duet["bvh"], "--task", task, "--frames", "16", "--out", str(out), *QUICK)
     made, recorded = Scene.load(out), Scene.load(duet["ours"][0])
-    frames = 48 + 16 if task in GOING_ON else 32 + 16
+    frames = 48 + 16 if task in GOING_ON else 16 if task == "generation" else 32 + 16
     assert (made.frames, made.present.tolist()) == (frames, [[True, True]])
     assert made.given is not None
-    assert task not in GOING_ON or made.given[0].sum(dim=0).tolist() == [48, 48]
+    assert task not in GOING_ON or made.given[0, :48].all()
     joints, truth = load_body().joints(made)[:, :48], load_body().joints(recorded)
     given = made.given[0, :48]
     assert torch.isfinite(joints).all()
@@ -74,13 +74,76 @@ def test_a_person_alone_gets_a_partner(duet, tmp_path, capsys) -> None:
     assert (body.joints(made)[0, :, 0] - body.joints(recorded)[0, :, 1]).abs().max() < 1e-3
 
 
-def test_what_goes_on_goes_on_from_the_end_of_the_recording(duet, tmp_path, capsys) -> None:
-    recorded = Scene.load(duet["ours"][0]).slice(0, 47)
+def test_what_goes_on_stands_behind_all_of_the_recording(duet, tmp_path, capsys) -> None:
+    """Also behind frames in front of whole tokens, so that music and cameras of the recording still fit."""
+    recorded, out = Scene.load(duet["ours"][0]).slice(0, 47), tmp_path / "out.npz"
     recorded.save(tmp_path / "long.npz")
-    text = said(capsys, str(tmp_path / "long.npz"), "--frames", "4", "--out", str(tmp_path / "out.npz"), *QUICK)
-    assert "the first 3 of 47 frames are left out" in text and "48 frames, of which 44 are given" in text
-    made = Scene.load(tmp_path / "out.npz")
-    assert torch.equal(made.body_rot[:, :44], recorded.body_rot[:, 3:])
+    words = (str(tmp_path / "long.npz"), "--frames", "4", "--samples", "2", "--out", str(out), *QUICK)
+    text = said(capsys, *words)
+    assert "of 47 frames the last 44 are read, for a token is 4, the 3 before them stay in front" in text
+    assert "102 frames, of which 94 are given" in text
+    made = Scene.load(out)
+    assert made.frames == 47 + 4 and made.given[:, :47].all() and not made.given[:, 47:].any()
+    for sample in range(2):
+        assert torch.equal(made.body_rot[sample, :47], recorded.body_rot[0])
+        assert torch.equal(made.T_world_root[sample, :47], recorded.T_world_root[0])
+    apart = Scene.load(tmp_path / "long.npz").slice(3).save(tmp_path / "apart.npz")
+    said(capsys, str(apart), *words[1:])
+    assert torch.equal(Scene.load(out).T_world_root, made.T_world_root[:, 3:]), "what is made is as without them"
+
+
+@pytest.mark.parametrize("case", ["recorded", "to the end", "not recorded"])
+def test_whom_a_task_leaves_out_is_as_recorded_or_said_to_stand_still(case: str, duet, tmp_path, capsys) -> None:
+    out, recorded = tmp_path / "out.npz", Scene.load(duet["ours"][0])
+    context, frames, end, line = {
+        "recorded": (32, 8, 40, "person 1 is not made by partner_prediction: as recorded in frames 32 to 39\n"),
+        "to the end": (32, 24, 48, "as recorded in frames 32 to 47, and stands still from frame 48\n"),
+        "not recorded": (48, 8, 48, "person 1 is not made by partner_prediction and stands still from frame 48\n"),
+    }[case]
+    words = ("--task", "partner_prediction", "--context", str(context), "--frames", str(frames), "--out", str(out))
+    text = said(capsys, *duet["ours"], *words, *QUICK)
+    made = Scene.load(out)
+    assert line in text and f"{context + frames} frames, of which {context} are given" in text
+    assert torch.equal(made.T_world_root[:, :end, 1], recorded.T_world_root[:, :end, 1])
+    assert torch.equal(made.body_rot[:, :end, 1], recorded.body_rot[:, :end, 1])
+    still = made.T_world_root[:, end - 1 :, 1]
+    assert torch.equal(still, still[:, :1].expand_as(still))
+    assert made.given[0].sum(dim=0).tolist() == [context, context + frames], "pictures show it as not made"
+
+
+def test_a_recording_that_is_put_in_afterwards_changes_nothing_that_is_made(duet, tmp_path, capsys) -> None:
+    recorded = Scene.load(duet["ours"][0])
+    other = recorded.T_world_root.clone()
+    other[:, 32:, 1, 0, 3] += 0.5
+    recorded.replace(T_world_root=other).save(tmp_path / "other.npz")
+    made = []
+    for path in (duet["ours"][0], str(tmp_path / "other.npz")):
+        words = ("--task", "partner_prediction", "--context", "32", "--frames", "16", "--out", str(tmp_path / "o.npz"))
+        said(capsys, path, *words, *QUICK)
+        made.append(Scene.load(tmp_path / "o.npz"))
+    first, second = made
+    assert torch.equal(first.T_world_root[:, :, 0], second.T_world_root[:, :, 0])
+    assert torch.equal(first.body_rot[:, :, 0], second.body_rot[:, :, 0])
+    assert not torch.equal(first.T_world_root[:, :, 1], second.T_world_root[:, :, 1])
+
+
+def test_a_task_that_is_given_nothing_says_that_files_tell_who_is_there(duet, tmp_path, capsys) -> None:
+    out = tmp_path / "out.npz"
+    words = ("--task", "generation", "--frames", "12", "--out", str(out))
+    text = said(capsys, *duet["ours"], *words, *QUICK)
+    assert "generation is given no motion: of the files only the number and shapes of people are read" in text
+    made = Scene.load(out)
+    assert (made.frames, bool(made.given.any()), made.agents) == (12, False, 2)
+    assert torch.equal(made.betas, Scene.load(duet["ours"][0]).betas)
+
+
+def test_what_is_given_is_counted_for_each_person(duet, tmp_path, capsys) -> None:
+    out = str(tmp_path / "out.npz")
+    keys = ("--task", "inbetweening", "--context", "0", "--task.keys", "[0, 4, -1]", "--out", out)
+    assert "inbetweening: 48 frames, of which 12 are given," in said(capsys, *duet["ours"], *keys, *QUICK)
+    one = ("--task.agents", "[1]")
+    text = said(capsys, *duet["ours"], *keys, *one, *QUICK)
+    assert "of which 0 of person 0 and 12 of person 1 are given," in text
 
 
 @pytest.mark.parametrize(("context", "given", "unread"), [(38, 36, 12), (32, 32, 16), (48, 48, 0)])
@@ -93,7 +156,7 @@ def test_a_context_is_of_whole_tokens_and_what_is_not_read_after_it_is_said(
     assert made.frames == given + 4
     assert torch.equal(made.body_rot[:, :given], recorded.body_rot[:, :given])
     assert (f"--context {context}: {given} are given" in text) == (given < context)
-    assert (f"{unread} of 48 recorded frames come after it and are not used" in text) == (unread > 0)
+    assert (f"{unread} of 48 recorded frames come after it and are not read" in text) == (unread > 0)
 
 
 def test_a_crowd_of_files_begins_with_their_last_second(duet, tmp_path, capsys) -> None:
@@ -112,7 +175,7 @@ def test_a_folder_is_answered_by_the_files_in_it(duet, tmp_path, capsys) -> None
 def test_a_short_file_is_given_whole(duet, tmp_path, capsys) -> None:
     Scene.load(duet["ours"][0]).slice(0, 14).save(tmp_path / "short.npz")
     said(capsys, str(tmp_path / "short.npz"), "--frames", "4", "--out", str(tmp_path / "out.npz"), *QUICK)
-    assert Scene.load(tmp_path / "out.npz").frames == 12 + 4, "in whole tokens"
+    assert Scene.load(tmp_path / "out.npz").frames == 14 + 4, "though whole tokens are read"
 
 
 def test_the_seed_decides_and_several_kinds_are_written(duet, tmp_path, capsys) -> None:
