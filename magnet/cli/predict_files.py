@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnet.cli import predict_written, scene_files
+from magnet.cli import predict_keys, predict_written, scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import taken_out
 
@@ -121,6 +121,7 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.api import Model, Motion
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.core import DenoiserCore
+    from magnet.motion.tokens import TOKEN_FRAMES
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
     if options.spacing is not None:
@@ -136,8 +137,11 @@ def main(arguments: Sequence[str]) -> int:
     task = task_of(options, groups["task"], added)
     files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)
     (files, lead), plan = predict_written.in_front(files, scene), plan_of(task, scene, context, frames, model)
-    unmade = ~plan.finished
-    for line in predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade):
+    unmade, past = ~plan.finished, context // TOKEN_FRAMES
+    for line in (
+        *predict_keys.said_of_keys(scene, plan.known, past),
+        *predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade),
+    ):
         print(line)
     began = time.perf_counter()
     made = model.predict(

@@ -17,6 +17,8 @@ from magnet.motion.tokens import TOKEN_FRAMES
 
 FASTEST = 1.6
 """Metres a second that steering may ask of somebody."""
+HURRIED = 3.0
+"""Metres a second above which a keyframe is reported as too far away."""
 
 
 @dataclass(frozen=True)
@@ -142,3 +144,8 @@ def speeds(keys: Iterable[Keyframe], scene: Scene, start: int) -> dict[tuple[int
         found[key.agent, key.frame] = math.hypot(key.goal.x - x, key.goal.z - z) / seconds
         at[key.agent] = (key.frame, [key.goal.x, key.goal.z])
     return found
+
+
+def pace(speed: float) -> str:
+    """How fast a keyframe is reached, in words, which say too where that is too fast. speed: m/s"""
+    return f"{speed:.1f} m/s from the one before" + (": too far" if speed > HURRIED else "")

@@ -14,7 +14,17 @@ from magnet.body.base import Body
 from magnet.body.reach import LIMBS
 from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
-from magnet.generation.keyframes import Goal, Keyframe, keyframe, limb_places, speeds, with_keyframes, with_limb
+from magnet.generation.keyframes import (
+    HURRIED,
+    Goal,
+    Keyframe,
+    keyframe,
+    limb_places,
+    pace,
+    speeds,
+    with_keyframes,
+    with_limb,
+)
 from magnet.generation.live import Live
 from magnet.motion.frames import canonical_frame
 from magnet.viewer.clock import Clock
@@ -39,8 +49,6 @@ class App(Protocol):
 
 NOBODY = "nobody"
 NO_KEYS = "no keyframe"
-HURRIED = 3.0
-"""Metres a second above which a keyframe is reported as too far away."""
 HERE = -1
 """Stands for the frame that is shown."""
 
@@ -276,8 +284,8 @@ class KeyframePanel:
         lines = []
         for entry in self.entries:
             speed = needed[entry.key.agent, entry.key.frame]
-            text = f"{entry.label}: {entry.key.frame / scene.fps:.1f} s, {speed:.1f} m/s from the one before"
-            lines.append(f"**{text}: too far**" if speed > HURRIED else text)
+            text = f"{entry.label}: {entry.key.frame / scene.fps:.1f} s, {pace(speed)}"
+            lines.append(f"**{text}**" if speed > HURRIED else text)
         self.list.content = "  \n".join([*lines, f"from frame {start} on all is made anew"])
 
 

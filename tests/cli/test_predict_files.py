@@ -146,6 +146,16 @@ def test_what_is_given_is_counted_for_each_person(duet, tmp_path, capsys) -> Non
     assert "of which 0 of person 0 and 12 of person 1 are given," in text
 
 
+def test_keyframes_that_nobody_can_reach_are_warned_of(duet, tmp_path, capsys) -> None:
+    recorded = Scene.load(duet["ours"][0])
+    roots = recorded.T_world_root.clone()
+    roots[:, 24:, 1, 0, 3] += 9.0
+    recorded.replace(T_world_root=roots).save(tmp_path / "far.npz")
+    keys = ("--task", "inbetweening", "--context", "0", "--task.keys", "[0, -1]", "--out", str(tmp_path / "o.npz"))
+    text = said(capsys, str(tmp_path / "far.npz"), *keys, *QUICK)
+    assert "warning: keyframe of person 1 at frame 44 (1.5 s): " in text and "too far" in text
+
+
 @pytest.mark.parametrize(("context", "given", "unread"), [(38, 36, 12), (32, 32, 16), (48, 48, 0)])
 def test_a_context_is_of_whole_tokens_and_what_is_not_read_after_it_is_said(
     context: int, given: int, unread: int, duet, tmp_path, capsys
