@@ -58,12 +58,13 @@ def meant(arguments: Sequence[str]) -> bool:
 
 
 def _names_files(arguments: Sequence[str]) -> bool:
-    """Whether files to read stand behind options: words with such suffixes that are no option's value."""
+    """Whether files to read stand behind options: words with such suffixes that are no option's value, or behind OUT
+    files that are there."""
     flag, values = "", 0
     for word in arguments:
         if word.startswith("--"):
             flag, values = word, int("=" in word or word in ("--trim", "--keep_floor"))
-        elif values and flag != "--out" and Path(word).suffix.lower() in READ:
+        elif values and Path(word).suffix.lower() in READ and (flag != "--out" or Path(word).exists()):
             return True
         else:
             values += 1
@@ -105,11 +106,9 @@ def main(arguments: Sequence[str]) -> int:
         taken, words = taken_out(words, rf"--{name}\.")
         groups[name] = list(itertools.chain.from_iterable(taken))
     options = parser().parse_intermixed_args(words)
-    for path in options.inputs:
-        if Path(path).suffix.lower() in READ and not Path(path).exists():  # before anything else is asked for
-            raise CommandError(f"{path}: no such file")
-        if Path(path).is_dir():
-            raise CommandError(f"{path} is a folder: give its files, {files_of(Path(path))}")
+    if options.people is None:
+        scene_files.require_inputs(options.inputs, options.out or ())
+    require_files(options.inputs)  # before anything else is asked for
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
@@ -165,6 +164,19 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
+
+
+def require_files(paths: Sequence[str]) -> None:
+    """Refuse files that are not there, and folders in their place.
+
+    Raises:
+        CommandError: names what is wrong.
+    """
+    for path in map(Path, paths):
+        if path.suffix.lower() in READ and not path.exists():
+            raise CommandError(f"{path}: no such file")
+        if path.is_dir():
+            raise CommandError(f"{path} is a folder: give its files, {files_of(path)}")
 
 
 def files_of(folder: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -148,6 +149,21 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
     if not got.scene.scenes:
         raise CommandError(f"{options.inputs[0]}: holds no scenes, so there is nothing to write")
     return got
+
+
+def require_inputs(inputs: Sequence[str], outs: Sequence[str]) -> None:
+    """Refuse a command line in which --out has taken the files to read.
+
+    Raises:
+        CommandError: says how to write it.
+    """
+    if outs and not inputs:
+        first, *behind = outs
+        right = f"{shlex.join(behind)} --out {first}" if behind else f"A.bvh B.bvh --out {first}"
+        raise CommandError(
+            f"--out {shlex.join(outs)}: takes all words behind it, so that nothing is left to read; files stand first, "
+            f"then options: magnet predict {right}"
+        )
 
 
 def require_each_once(inputs: Sequence[str]) -> None:

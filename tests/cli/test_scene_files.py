@@ -86,6 +86,16 @@ def test_people_in_one_place_are_warned_of(folder: Path, capsys: pytest.CaptureF
     assert "warning" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("more", [[], ["--frames", "20"]])
+def test_files_that_out_has_taken_are_not_written_over(
+    more: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = Path("take_0.bvh").read_bytes()
+    said = refused(capsys, "predict", "--out", "z.npz", "take_0.bvh", "take_1.bvh", *more)
+    assert "files stand first, then options: magnet predict take_0.bvh take_1.bvh --out z.npz" in said
+    assert Path("take_0.bvh").read_bytes() == before and not Path("z.npz").exists()
+
+
 def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, "refine", "duet.npz", "--shapes", "duet.npz", "o.npz")
     assert "files stand first, then options, for --shapes takes all words behind it" in said
