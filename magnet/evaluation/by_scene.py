@@ -98,11 +98,11 @@ def _read(written: Mapping[str, Any], scenes: int) -> Floats:
 # -- what a run measures -------------------------------------------------------------------
 
 
-def newest(metrics: Mapping[str, MetricCollection], scenes: int) -> list[Measured]:
-    """What the last `update` measured in each of its scenes, by method."""
+def newest(metrics: Mapping[str, Any], scenes: int) -> list[Measured]:
+    """What the last `update` measured in each of its scenes, by method; nothing of one without a `MetricCollection`."""
     found: list[Measured] = [{method: {} for method in metrics} for _ in range(scenes)]
     for method, collection in metrics.items():
-        for metric in collection.values():
+        for metric in collection.values() if isinstance(collection, MetricCollection) else ():
             if isinstance(metric, ClipMeans) and metric.clips:  # none of a stranger's that failed
                 for scene, sums in zip(found, metric.clips[-1].tolist(), strict=True):
                     scene[method] |= {
