@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(
             f"--context {options.context}: got {scene.frames} frames, so at most {scene.frames} were given"
         )
-    scene_files.require_unread(out, options.inputs, scene.present.sum(dim=1).tolist(), options.smplx, options.each)
+    scene_files.require_unread(out, options.inputs, scene_files.slots_of(scene), options.smplx, options.each)
     print(described(scene))
     if options.smplx and is_open(got.body):
         print("shapes of the open body mean nothing to SMPL-X: betas are zero, and transl is that of its mean shape")

@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         require_place(options.plot)
     got = scene_files.read_inputs(options, scene_files.reading(options))
     read = [*options.inputs, *(options.shapes or ())]
-    scene_files.require_unread(out, read, got.scene.present.sum(dim=1).tolist())
+    scene_files.require_unread(out, read, scene_files.slots_of(got.scene))
     formats.require_finite(got.scene, "cut such frames out")
     if not got.scene.frames or not bool(got.scene.present.any()):
         what = "people" if got.scene.frames else "frames"

@@ -105,14 +105,14 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 
 
 def require_unread(
-    path: Path, inputs: Sequence[str], people: Sequence[int], smplx: bool = False, each: bool = False
+    path: Path, inputs: Sequence[str], people: Sequence[int | Sequence[int]], smplx: bool = False, each: bool = False
 ) -> None:
     """Refuse to write over an input, which may be somebody's only recording: OUT itself, or a file of OUT's people.
 
     Args:
         path: OUT.
         inputs: files that are read.
-        people: how many are there in each scene that is written.
+        people: slots of who is there in each scene that is written, or how many, who then have the first ones.
         smplx, each: as for `formats.write`.
 
     Raises:
@@ -121,7 +121,8 @@ def require_unread(
     from magnet.export import formats
 
     read = [source for source in map(Path, inputs) if source.exists()]
-    for file in formats.files_of(path, people, smplx, each):
+    slots = [range(there) if isinstance(there, int) else there for there in people]
+    for file in formats.files_of(path, slots, smplx, each):
         for source in read if file.exists() else ():
             if not file.samefile(source):
                 continue
@@ -131,6 +132,11 @@ def require_unread(
                 f"{path}: people and scenes get a {path.suffix.lower()} each, and {source.name}, which is read, "
                 "would be one of them; give OUT another name"
             )
+
+
+def slots_of(scene: Scene) -> list[list[int]]:
+    """Slots of who is there, scene by scene."""
+    return [there.nonzero()[:, 0].tolist() for there in scene.present]
 
 
 def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:

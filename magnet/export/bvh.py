@@ -28,7 +28,7 @@ TIPS: dict[int, tuple[float, float, float]] = {
 
 
 def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") -> list[Path]:
-    """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ..., or the path itself for one person.
+    """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ... by slot, or the path itself for one.
 
     All people keep their places in the scene's world, y up. Joints have SMPL-X's names; the root's position is the
     pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
@@ -61,7 +61,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     written = []
-    for p, each in enumerate(paths_of(path, people.scenes)):
+    for p, each in enumerate(paths_of(path, scene.present[0].nonzero()[:, 0].tolist())):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)
@@ -77,10 +77,10 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
     return written
 
 
-def paths_of(path: Path, people: int) -> list[Path]:
-    """The files of so many people: out_0.bvh, out_1.bvh ..., or the path itself for one person."""
+def paths_of(path: Path, slots: Sequence[int]) -> list[Path]:
+    """The files of people in these slots: out_0.bvh, out_1.bvh ..., or the path itself for one person."""
     path = path.with_suffix(".bvh")
-    return [path] if people == 1 else [path.with_name(f"{path.stem}_{p}.bvh") for p in range(people)]
+    return [path] if len(slots) == 1 else [path.with_name(f"{path.stem}_{slot}.bvh") for slot in slots]
 
 
 def offsets_of(rest: Tensor) -> Tensor:

@@ -334,14 +334,14 @@ def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
     return [path.with_name(f"{path.stem}_scene{b}{path.suffix.lower()}") for b in range(scenes)]
 
 
-def files_of(path: Path, people: Sequence[int], smplx: bool = False, each: bool = False) -> list[Path]:
-    """The files that `write` writes, known before there is a scene. people: how many are there in each scene"""
-    places = places_of(path, len(people), smplx)
+def files_of(path: Path, slots: Sequence[Sequence[int]], smplx: bool = False, each: bool = False) -> list[Path]:
+    """The files that `write` writes, known before there is a scene. slots: of who is there in each scene"""
+    places = places_of(path, len(slots), smplx)
     if smplx and each:
-        return [file for place, count in zip(places, people, strict=True) for file in each_of(place, count)]
+        return [file for place, there in zip(places, slots, strict=True) for file in each_of(place, there)]
     if path.suffix.lower() != ".bvh":
         return places
-    return [file for place, count in zip(places, people, strict=True) for file in paths_of(place, count)]
+    return [file for place, there in zip(places, slots, strict=True) for file in paths_of(place, there)]
 
 
 def left_over(written: Sequence[Path]) -> list[Path]:

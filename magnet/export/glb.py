@@ -30,8 +30,8 @@ INFLUENCES = 4
 def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
 
-    Each person present is a node `person_0`, `person_1` ... with a bone on the floor, the 22 joints below it, and a
-    mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose. People of one shape
+    Each person present is a node `person_0`, `person_1` ..., numbered by slot, with a bone on the floor, the 22 joints
+    below it, and a mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose. People of one shape
     share a mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
 
     Args:
@@ -49,14 +49,14 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
     shaped: dict[bytes, dict[str, int]] = {}
     whole = _animation("motion")
-    for number, slot in enumerate(slots):
+    for slot in slots:
         betas = scene.betas[0, slot].detach().cpu().float()
         shape = shaped.setdefault(betas.numpy().tobytes(), {})
         if not shape:
             shape |= gltf.shape_of(body, betas)
-        pelvis, floor = gltf.person(number, slot, standing(body, betas), {**skin, **shape}, bones)
+        pelvis, floor = gltf.person(slot, standing(body, betas), {**skin, **shape}, bones)
         T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu()
-        clip = whole if bones.clips == "scene" else _animation(f"person_{number}")
+        clip = whole if bones.clips == "scene" else _animation(f"person_{slot}")
         if floor is not None:
             T_world_floor = canonical_frame(T_above_pelvis)
             T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
@@ -180,15 +180,13 @@ class _Gltf:
             "NORMAL": self.accessor(normals, FLOAT, "VEC3", VERTEX_DATA),
         }
 
-    def person(
-        self, number: int, slot: int, rest: Tensor, mesh: dict[str, int], bones: BoneOptions
-    ) -> tuple[int, int | None]:
+    def person(self, slot: int, rest: Tensor, mesh: dict[str, int], bones: BoneOptions) -> tuple[int, int | None]:
         """Nodes, colour, mesh and skin of one person at rest. rest (22, 3), standing
 
         Returns:
             The pelvis's node, after which joints follow in order, and that of the bone on the floor.
         """
-        label = f"person_{number}"
+        label = f"person_{slot}"
         group = self.add("nodes", {"name": label, "children": []})
         floor = self.add("nodes", {"name": "root", "children": []}) if bones.root == "floor" else None
         pelvis = len(self.document["nodes"])

@@ -44,7 +44,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     that pelvises are right in SMPL-X's tools, and `body_betas` (P, 10) keeps the shapes for `read_smplx`.
 
     Args:
-        apart: one file per person (path_0.npz, ...) without the axis P, as most tools expect.
+        apart: one file per person (path_0.npz ... by slot) without the axis P, as most tools expect.
 
     Returns:
         The paths written.
@@ -56,7 +56,8 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     require_body(scene, body.id)
     if not bool(scene.present.any()):
         raise ValueError("nobody is present in the scene, so there is nobody to write")
-    scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
+    slots = scene.present[0].nonzero()[:, 0]
+    scene = scene.permute_agents(slots)
     T_world_root = scene.T_world_root[0].transpose(0, 1).double()  # (P, T, 4, 4)
     turned = torch.cat([T_world_root[..., None, :3, :3], scene.body_rot[0].transpose(0, 1).double()], dim=2)
     poses = torch.zeros(*turned.shape[:2], 3 * SMPLX_JOINTS, dtype=torch.float64)
@@ -88,15 +89,15 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     if not apart:
         save_npz(path, arrays | facts)
         return [path]
-    paths = each_of(path, scene.agents)
+    paths = each_of(path, slots.tolist())
     for p, each in enumerate(paths):
         save_npz(each, {key: value[p] for key, value in arrays.items()} | facts)
     return paths
 
 
-def each_of(path: Path, people: int) -> list[Path]:
-    """The files of so many people written apart: out_0.npz, out_1.npz ..."""
-    return [path.with_name(f"{path.stem}_{p}.npz") for p in range(people)]
+def each_of(path: Path, slots: Sequence[int]) -> list[Path]:
+    """The files of people in these slots, written apart: out_0.npz, out_1.npz ..."""
+    return [path.with_name(f"{path.stem}_{slot}.npz") for slot in slots]
 
 
 def is_open(body: Body) -> bool:

@@ -46,8 +46,8 @@ def require_usd() -> None:
 def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as UsdSkel: metres, y up, a time code for every frame of the scene.
 
-    Each person present is `/scene/person_0` ... with a skeleton of 22 joints, on the floor at rest, its animation and a
-    mesh skinned to it in the slot's colour. The suffix says which kind of USD: text (.usda), binary (.usdc) or packed
+    Each person present is `/scene/person_0` ..., numbered by slot, with a skeleton of 22 joints, on the floor at rest,
+    its animation and a mesh skinned to it in the slot's colour. The suffix says which kind of USD: text (.usda), binary (.usdc) or packed
     (.usdz).
 
     Args:
@@ -77,10 +77,10 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(scene.frames - 1)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
-    for number, slot in enumerate(slots):
+    for slot in slots:
         betas = scene.betas[0, slot].detach().cpu().float()
         place, turns = _moved(scene, slot, bones)
-        root = UsdSkel.Root.Define(stage, f"/scene/person_{number}")
+        root = UsdSkel.Root.Define(stage, f"/scene/person_{slot}")
         _skeleton(stage, root, standing(body, betas), bones, place, turns)
         _skin(stage, root, standing_vertices(body, betas), body, slot)
     stage.GetRootLayer().Save()

@@ -59,6 +59,17 @@ def test_one_person_of_several_is_written_alone(stored: Path, capsys: pytest.Cap
     assert Scene.load(out).present.tolist() == [[False, True]] * 2
 
 
+def test_people_of_several_keep_their_numbers_in_the_names_of_files(tmp_path: Path) -> None:
+    four = random_scene(1, 4, 4, torch.Generator().manual_seed(0)).save(tmp_path / "four.npz")
+    some = ("--person", "1", "--person", "3")
+    assert cli.main(["export", str(four), str(tmp_path / "some.bvh"), *some]) == 0
+    assert cli.main(["export", str(four), str(tmp_path / "some.npz"), *some, "--smplx", "--each"]) == 0
+    names = {path.name for path in tmp_path.glob("some*")}
+    assert names == {"some_1.bvh", "some_3.bvh", "some_1.npz", "some_3.npz"}
+    assert cli.main(["export", str(four), str(tmp_path / "one.bvh"), "--person", "3"]) == 0
+    assert (tmp_path / "one.bvh").exists(), "who is alone takes OUT's name"
+
+
 def test_skeletons_of_two_people_become_one_scene(stored: Path, capsys: pytest.CaptureFixture[str]):
     scene, body = Scene.load(stored).select([0]), load_body()
     paths = [str(path) for path in save_bvh(scene, stored.with_name("a.bvh"), body, unit="cm")]

@@ -232,3 +232,13 @@ def test_scenes_that_cannot_be_written_are_named(trio: Scene, body: Body, tmp_pa
         save_glb(trio.replace(present=torch.zeros(1, 3, dtype=torch.bool)), tmp_path / "a.glb", body)
     with pytest.raises(ValueError, match="belongs to body 'other'"):
         save_glb(trio.replace(body="other"), tmp_path / "a.glb", body)
+
+
+def test_people_who_are_written_alone_keep_their_numbers(trio: Scene, body: Body, tmp_path: Path) -> None:
+    """Or a file a person, as engines want them, would hold clips of one name."""
+    for present, numbers in (([False, True, False], [1]), ([True, False, True], [0, 2])):
+        some = trio.replace(present=torch.tensor([present]))
+        opened = Opened(save_glb(some, tmp_path / "some.glb", body, BoneOptions(clips="person")))
+        assert [clip.name for clip in opened.gltf.animations] == [f"person_{p}" for p in numbers]
+        assert [node.name for node in opened.people()] == [f"person_{p}_body" for p in numbers]
+        assert [skin.name for skin in opened.gltf.skins] == [f"person_{p}" for p in numbers]

@@ -58,6 +58,14 @@ def test_pixars_library_poses_joints_and_skin_where_the_body_has_them(suffix: st
             assert np.abs(points - vertices[frame, person]).max() < 1e-4
 
 
+def test_people_keep_their_numbers(body: Body, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    scene = random_scene(1, 3, 4, torch.Generator().manual_seed(4))
+    some = scene.replace(present=torch.tensor([[False, True, False, True]]))
+    stage = usd.Stage.Open(str(save_usd(some, tmp_path / "some.usda", body)))
+    assert [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()] == ["person_1", "person_3"]
+
+
 def test_without_the_package_the_extra_is_named(body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(ImportError, match=r"pip install \"magnet-motion\[usd\]\""):
