@@ -47,8 +47,8 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     """Write one scene (B = 1) as UsdSkel: metres, y up, a time code for every frame of the scene.
 
     Each person present is `/scene/person_0` ..., numbered by slot, with a skeleton of 22 joints, on the floor at rest,
-    its animation and a mesh skinned to it in the slot's colour. The suffix says which kind of USD: text (.usda), binary (.usdc) or packed
-    (.usdz).
+    its animation and a mesh skinned to it in the slot's colour. The suffix says which kind of USD: text (.usda), binary
+    (.usdc) or packed (.usdz).
 
     Args:
         bones: names and hierarchy of joints; USD always has one animation per skeleton.
