@@ -77,20 +77,22 @@ def read(
     joints: dict[str, str] | None = None,
     keep_floor: bool = False,
     in_fps: float | None = None,
+    start: int = 0,
+    end: int | None = None,
 ) -> Motion:
     """Read a scene from our own file, SMPL-X npz files or BVH files of any skeleton; several files are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor, in_fps: as in `magnet.export.formats.Reading`. A unit or axis that nobody
-            can have is taken as it is said, with a warning that names what the files look like.
+        trim, unit, up, joints, keep_floor, in_fps, start, end: as in `magnet.export.formats.Reading`. A unit or axis
+            that nobody can have is taken as it is said, with a warning that names what the files look like.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
-    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps)
+    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
     got = formats.read(list(paths), body, options)
     for warning in formats.warned(got.notes):
         warnings.warn(warning, stacklevel=2)

@@ -27,9 +27,11 @@ def parser_of(command: str, description: str | None, epilog: str, inputs: str = 
 
 
 def add_body(options: Options) -> None:
-    """--body and --trim, which say how several files become one scene."""
+    """--body, --trim, --start and --end, which say how files become one scene, and what of them."""
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
+    options.add_argument("--start", **START)
+    options.add_argument("--end", **END)
 
 
 def add_origin(options: Options) -> None:
@@ -56,6 +58,8 @@ def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
         joints=dict(pair.partition("=")[::2] for pair in options.joint),
         keep_floor=options.keep_floor,
         in_fps=options.in_fps,
+        start=options.start,
+        end=options.end,
     )
 
 
@@ -69,6 +73,18 @@ def add_look(options: Options) -> None:
 
 IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz files that do not say it"}
 """An option of commands that read files."""
+START: dict[str, Any] = {
+    "type": int,
+    "default": 0,
+    "metavar": "FRAME",
+    "help": "first frame of the files that is read, from 0",
+}
+END: dict[str, Any] = {
+    "type": int,
+    "metavar": "FRAME",
+    "help": "frame of the files before which reading ends (default: all)",
+}
+"""Options that choose a part of what commands read, counted at the file's own rate."""
 PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
 """An option that names a person, and may be repeated."""
 MOMENTS, SAME_PLACE = 30, 0.02

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magnet.cli.flags import PlainParser
-from magnet.cli.scene_files import IN_FPS
+from magnet.cli.scene_files import END, IN_FPS, START
 from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
@@ -45,6 +45,8 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
     add("--in_fps", **IN_FPS)
+    add("--start", **START)
+    add("--end", **END)
     styles = ("body", "light", "capsules", "skeleton")
     add("--style", choices=styles, help="default: body, light for crowds")
     add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
@@ -131,7 +133,8 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.viewer.takes import read_takes
 
     body = load_body(options.body or "open")
-    takes, body = read_takes(options.files, body, options.context, options.samples, options.in_fps)
+    part = options.in_fps, options.start, options.end
+    takes, body = read_takes(options.files, body, options.context, options.samples, *part)
     longest = max(each.scene.frames for each in takes)
     if options.context > longest:
         raise ValueError(f"--context {options.context}: got {longest} frames, so at most {longest} were given")
@@ -144,7 +147,8 @@ def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
 
     if not options.truth:
         return None
-    truth = read_takes([options.truth], body, samples=1, in_fps=options.in_fps)[0][0]
+    part = options.in_fps, options.start, options.end
+    truth = read_takes([options.truth], body, 0, 1, *part)[0][0]
     if abs(truth.scene.fps - fps) > 1e-3:
         raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
     return truth

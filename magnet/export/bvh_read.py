@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.export.cutting import kept_frames
 from magnet.motion.bvh import AXES, BvhHeader, BvhJoint, bvh_header
 from magnet.motion.runs import filled
 
@@ -52,7 +53,7 @@ class Bvh:
         return turned, at
 
 
-def read_bvh(path: str | Path, gaps: bool = False) -> Bvh:
+def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | None = None) -> Bvh:
     """Read one BVH file.
 
     Position channels of a joint replace its OFFSET, as most programs write them, and are added to it where they
@@ -61,10 +62,12 @@ def read_bvh(path: str | Path, gaps: bool = False) -> Bvh:
     Args:
         path: the file.
         gaps: frames may hold NaN or infinity, where tracking was lost: they become `Bvh.tracked`.
+        start, end: the frames that are kept, from 0, without `end`; None: to the last.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no BVH, truncated, or a line makes no sense; names file and line. NaN in all frames, or in any.
+        ValueError: no BVH, truncated, or a line makes no sense; names file and line. NaN in all frames, or in any
+            that is kept. No such frames.
     """
     path = Path(path)
     try:
@@ -74,7 +77,11 @@ def read_bvh(path: str | Path, gaps: bool = False) -> Bvh:
     lines = text.splitlines()
     header = bvh_header(lines, path)
     joints, parents = _without_ends(header.joints)
-    values, tracked = _motion(path, lines, header, gaps)
+    values, tracked = _motion(path, lines, header)
+    kept = kept_frames(path, len(values), start, end)
+    if tracked is not None and not (gaps and tracked.any()):
+        _require_finite(path, header.first + 1, tracked, kept)
+        tracked = None
     offsets = np.array([joint.offset for joint in joints], dtype=np.float64)
     T, K = len(values), len(joints)
     place = np.broadcast_to(offsets, (T, K, 3)).copy()
@@ -93,7 +100,9 @@ def read_bvh(path: str | Path, gaps: bool = False) -> Bvh:
         if moved:
             place[:, k] = _placed(offsets[k], moved, T, reach)
     names = tuple(joint.name for joint in joints)
-    return Bvh(names, parents, offsets, place, local, _rate(header.seconds, header.digits), path, tracked)
+    fps = _rate(header.seconds, header.digits)
+    # Cut last: where the root is counted from is told by the whole file.
+    return Bvh(names, parents, offsets, place[kept], local[kept], fps, path, None if tracked is None else tracked[kept])
 
 
 def _rest(offsets: Floats, parents: Sequence[int]) -> Floats:
@@ -145,8 +154,8 @@ def _without_ends(written: Sequence[BvhJoint]) -> tuple[list[BvhJoint], tuple[in
     return joints, tuple(number[joint.parent] for joint in joints)
 
 
-def _motion(path: Path, lines: Sequence[str], header: BvhHeader, gaps: bool) -> tuple[Floats, Bools | None]:
-    """All numbers (T, D); and (T,) which frames were finite, None: all."""
+def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> tuple[Floats, Bools | None]:
+    """All numbers (T, D), those of frames that are not finite as before them; and (T,) which were, None: all."""
     frames, width = header.frames, header.width
     words = " ".join(lines[header.first :]).split()
     if len(words) != frames * width:
@@ -160,12 +169,21 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader, gaps: bool) -> 
     finite: Bools = np.logical_and.reduce(np.isfinite(values), axis=1)
     if finite.all():
         return values, None
-    if gaps and finite.any():
-        return filled(values[:, None], finite[:, None])[:, 0], finite
-    frame = int((~finite).argmax())
-    line = header.first + 1 + frame
-    out = "every frame does" if not finite.any() else "leave such frames out in all files of the scene"
-    raise ValueError(f"{path}:{line}: frame {frame + 1} holds NaN or infinity; {out}")
+    return (filled(values[:, None], finite[:, None])[:, 0] if finite.any() else values), finite
+
+
+def _require_finite(path: Path, first: int, finite: Bools, kept: slice) -> None:
+    """Refuse NaN in frames that are kept. first: line of the first frame; finite (T,)
+
+    Raises:
+        ValueError: names the line and the frame.
+    """
+    bad = np.flatnonzero(~finite[kept])
+    if len(bad):
+        frame = (kept.start or 0) + int(bad[0])
+        leave = "leave such frames out in all files of the scene, as --start and --end do at the beginning and the end"
+        out = leave if finite.any() else "every frame does"
+        raise ValueError(f"{path}:{first + frame}: frame {frame} holds NaN or infinity; {out}")
 
 
 def _rate(seconds: float, digits: int) -> float:

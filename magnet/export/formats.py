@@ -60,6 +60,7 @@ class Reading:
         joints: for BVH: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
         in_fps: frames a second of npz files that do not say it.
+        start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
     """
 
     fps: float | None = None
@@ -69,6 +70,8 @@ class Reading:
     joints: Mapping[str, str] = field(default_factory=dict)
     keep_floor: bool = False
     in_fps: float | None = None
+    start: int = 0
+    end: int | None = None
 
 
 def read(
@@ -108,7 +111,7 @@ def read(
             way = "lowered" if imported.floor > 0 else "raised"
             notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
-    people = read_people(files, body, options.up, options.unit, options.in_fps)
+    people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = [note for one in people for note in one.notes]
     if len(scenes) == 1:

@@ -31,8 +31,8 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     """Write one scene (B = 1) as binary glTF 2.0: metres, y up, a keyframe for every frame of the scene.
 
     Each person present is a node `person_0`, `person_1` ..., numbered by slot, with a bone on the floor, the 22 joints
-    below it, and a mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose. People
-    of one shape share a mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
+    below it, and a mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose.
+    People of one shape share a mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
 
     Args:
         bones: names and hierarchy of bones, and the number of animations.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magnet.body import Body
+from magnet.export.cutting import kept_frames, require_one_clock
 from magnet.export.npz import clear_axes, is_open, read_smplx, require_rate, stance_in, unit_against
 from magnet.export.smpl_keys import posed
 from magnet.export.upright import agreed, said, told_against
@@ -26,23 +27,35 @@ class NpzFile:
 
 
 def read_people(
-    files: Sequence[Path], body: Body, up: str | None, unit: str | None, in_fps: float | None
+    files: Sequence[Path],
+    body: Body,
+    up: str | None,
+    unit: str | None,
+    in_fps: float | None,
+    start: int = 0,
+    end: int | None = None,
 ) -> list[NpzFile]:
     """Read the npz files of one scene, other programs' with the axis that suits them together.
 
     Args:
         files: one for each person, or one for all.
         body, up, unit, in_fps: as in `magnet.export.npz.read_smplx`.
+        start, end: the frames that are read, from 0, without `end`; None: to the last.
 
     Raises:
-        ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts.
+        ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts; no such
+            frames.
     """
     people = [_read(file, body, up, unit, in_fps) for file in files]
     if up is None and len(people) > 1:
         people = _of_one_axis(files, people, body, unit, in_fps)
     warned = told_against(up, [axis for one in people for axis in clear_axes(one.scene, up)]) if up else []
     warned += unit_against([one.scene for one in people], unit) if unit else []
-    return [replace(people[0], notes=[*people[0].notes, *warned]), *people[1:]] if warned else people
+    people = [replace(people[0], notes=[*people[0].notes, *warned]), *people[1:]] if warned else people
+    require_one_clock(files, [one.scene.fps for one in people], start, end)
+    # Cut last: the whole file tells which way is up.
+    kept = [kept_frames(file, one.scene.frames, start, end) for file, one in zip(files, people, strict=True)]
+    return [replace(one, scene=one.scene.slice(part.start, part.stop)) for one, part in zip(people, kept, strict=True)]
 
 
 def _of_one_axis(

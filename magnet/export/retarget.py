@@ -22,6 +22,7 @@ from magnet.body.joints import (  # isort: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
+from magnet.export.cutting import require_one_clock
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood_together
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resampled
@@ -38,6 +39,8 @@ FARTHEST_SWING = math.radians(110.0)
 """Largest angle between a bone in our rest pose and in theirs; beyond it the bone's roll is ambiguous."""
 SAME_BODY = 0.002
 """Largest difference of rest joints, in metres, for a skeleton to count as the body's own."""
+RESTS = 2
+"""First frames that hold a rest pose, at most, where programs put one before the motion."""
 POOR_FIT, REFUSED_FIT = 0.04, 0.15
 """Mean distance of joints, in metres, above which a fit is reported as poor, and above which it is refused."""
 
@@ -55,7 +58,7 @@ class Source:
     exact: bool  # the skeleton is the body's own: nothing had to be fitted
     residual: float  # metres between limb joints and the file's, mean over joints and frames
     worst: str  # limb joint with the largest mean residual
-    jumps: tuple[int, ...] = ()  # frames to which everything jumps
+    jumps: tuple[int, ...] = ()  # frames of the file to which everything jumps
     notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
 
     @property
@@ -73,9 +76,20 @@ class Source:
             if self.unused:
                 lines.append(f"  not mapped: {', '.join(self.unused)}")
         if self.jumps:
-            where = ", ".join(map(str, self.jumps[:5])) + (", ..." if len(self.jumps) > 5 else "")
-            lines.append(f"  everything jumps to frame {where} (a rest pose before it, or a cut?): better leave it out")
+            lines.append(f"  {_jumps_said(self.jumps)}")
         return "\n".join(lines)
+
+
+def _jumps_said(jumps: Sequence[int]) -> str:
+    """What it may mean that everything jumps to these frames, and what to do."""
+    where = ", ".join(map(str, jumps[:5])) + (", ..." if len(jumps) > 5 else "")
+    if len(jumps) > 1:
+        why = "stepped keys, or cuts? Nothing is drawn between them"
+        return f"everything jumps to frames {where} ({why}): bake motion first, or keep a part with --start and --end"
+    (frame,) = jumps
+    if frame <= RESTS:
+        return f"everything jumps to frame {frame} (a rest pose before it?): better leave it out, --start {frame}"
+    return f"everything jumps to frame {frame} (a cut?): keep one part, --end {frame} or --start {frame}"
 
 
 @dataclass(frozen=True)
@@ -97,6 +111,8 @@ def load_bvh(
     up: str | None = None,
     joints: Mapping[str, str] | None = None,
     keep_floor: bool = False,
+    start: int = 0,
+    end: int | None = None,
 ) -> Imported:
     """Read BVH files, one per person: our own files, or any skeleton with known joint names.
 
@@ -111,10 +127,12 @@ def load_bvh(
         up: `y`, `z`, `-y` ...; None: found from where torsos point, and rest poses where somebody lies.
         joints: our joint's name to theirs, for names that no scheme knows.
         keep_floor: keep fitted people at the height they were recorded at.
+        start, end: the frames of each file that are read, at its own rate, from 0 and without `end`; None: to the last.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not a BVH file, unknown names, units or up axis, rates or lengths that differ, no fit.
+        ValueError: not a BVH file, unknown names, units or up axis, rates or lengths that differ, no fit, no such
+            frames.
     """
     each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not each:
@@ -123,7 +141,8 @@ def load_bvh(
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    files = [read_bvh(path) for path in each]
+    files = [read_bvh(path, start=start, end=end) for path in each]
+    require_one_clock(each, [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
     if len(rates) > 1 and fps is None:
         found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
@@ -132,7 +151,8 @@ def load_bvh(
         )
     skeletons = understood_together(files, unit, up, joints)
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
-    sources = tuple(replace(how, jumps=_jumps(each)) for (_, how), each in zip(read, skeletons, strict=True))
+    jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
+    sources = tuple(replace(how, jumps=found) for (_, how), found in zip(read, jumps, strict=True))
     labels = [str(path) for path in each]
     scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
     floor = 0.0

@@ -22,10 +22,13 @@ def read_takes(
     context: int = 0,
     samples: int = SAMPLES,
     in_fps: float | None = None,
+    start: int = 0,
+    end: int | None = None,
 ) -> tuple[list[ShownTake], Body]:
     """The takes in several files, and their body.
 
-    body: the user's; by default the open one. in_fps: frames a second of npz files that do not say it.
+    body: the user's; by default the open one. in_fps: frames a second of npz files that do not say it. start, end: the
+    frames that are read, from 0, without `end`; None: to the last.
 
     Raises:
         FileNotFoundError: no such file.
@@ -34,7 +37,7 @@ def read_takes(
     body = body or load_body("open")
     found: list[tuple[Path, ShownTake]] = []
     for path in map(Path, paths):
-        scene, recording = read_scene(path, body, in_fps)
+        scene, recording = read_scene(path, body, in_fps, start, end)
         here = takes(scene, path.stem, context, samples)
         if recording is not None:
             here = [take(path.stem, scene, context, recording)]
@@ -48,22 +51,26 @@ def read_takes(
     return [each for _, each in found], body
 
 
-def read_scene(path: Path, body: Body, in_fps: float | None = None) -> tuple[Scene, DenoisingTrace | None]:
+def read_scene(
+    path: Path, body: Body, in_fps: float | None = None, start: int = 0, end: int | None = None
+) -> tuple[Scene, DenoisingTrace | None]:
     """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
 
-    in_fps: as for `read_takes`.
+    in_fps, start, end: as for `read_takes`.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not one of these, damaged, or of another body.
+        ValueError: not one of these, damaged, or of another body; no such frames, or a part of a recording of steps.
     """
     if path.suffix.lower() == ".npz" and zipfile.is_zipfile(path) and is_trace(path):
         recording = DenoisingTrace.load(path)
         if recording.scene.body != body.id:
             raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
+        if start or end is not None:
+            raise ValueError(f"{path}: a recording of denoising is shown whole; leave out --start and --end")
         return recording.scene, recording
     try:
-        return read(path, body, Reading(in_fps=in_fps)).scene, None
+        return read(path, body, Reading(in_fps=in_fps, start=start, end=end)).scene, None
     except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
 

@@ -18,6 +18,7 @@ from magnet.body import JOINT_NAMES, PARENTS, load_body, on_floor
 from magnet.export import save_bvh
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene
+from magnet.synthesis import synthesize
 from magnet.testing import random_scene
 from tests.cases import some_slow
 from tests.export import strangers
@@ -57,6 +58,24 @@ def test_one_person_of_several_is_written_alone(stored: Path, capsys: pytest.Cap
     assert cli.main(["export", str(stored), str(out), "--person", "1"]) == 0
     assert "2 scenes of 1 person" in capsys.readouterr().out
     assert Scene.load(out).present.tolist() == [[False, True]] * 2
+
+
+@pytest.mark.parametrize("command", ["export", "refine", "view", "predict"])
+def test_every_command_that_reads_motion_reads_a_part(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = synthesize("handshake", 2, 120, torch.Generator().manual_seed(1), load_body()).scene.slice(40, 80)
+    scene = made.save(tmp_path / "duet.npz")
+    out, part = str(tmp_path / "part.npz"), ("--start", "8", "--end", "30")
+    words = {
+        "view": ["--html", str(tmp_path / "part.html")],
+        "predict": ["--out", out, "--frames", "4", "--context", "8", "--sampler.steps", "1"],
+    }
+    assert cli.main([command, str(scene), *words.get(command, [out]), *part]) == 0
+    if command == "export":
+        assert torch.equal(Scene.load(out).T_world_root, made.slice(8, 30).T_world_root)
+    assert cli.main([command, str(scene), *words.get(command, [out]), "--start", "40"]) == 2
+    assert "holds 40 frames, so start 40 is behind them" in capsys.readouterr().err
 
 
 def test_people_of_several_keep_their_numbers_in_the_names_of_files(tmp_path: Path) -> None:

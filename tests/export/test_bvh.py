@@ -159,7 +159,7 @@ BREAKS = {
         r"Frame Time: \S+", "Frame Time: 0,0333333", text
     ),
     "expected the lines 'Frames: N'": lambda text: text.replace("Frames: 20", "Frames: many"),
-    "frame 20 holds NaN or infinity; leave such frames out in all": lambda text: re.sub(r"\S+\n$", "nan\n", text),
+    "frame 19 holds NaN or infinity; leave such frames out in all": lambda text: re.sub(r"\S+\n$", "nan\n", text),
     "something that is no number": lambda text: re.sub(r"\S+\n$", "1.2.3\n", text),
     r":5: CHANNELS 6 X .*: expected 6 of": lambda text: text.replace("CHANNELS 6 Xposition", "CHANNELS 6 X", 1),
     r":4: got 0.0 0.0, expected 3 finite": lambda text: re.sub(r"OFFSET [0. ]+", "OFFSET 0.0 0.0", text, count=1),
@@ -178,6 +178,17 @@ def test_a_broken_file_is_named_with_what_is_wrong(message, trio: Scene, body: B
     with pytest.raises(ValueError, match=message) as error:
         read_bvh(path)
     assert str(path) in str(error.value)
+
+
+def test_frames_that_hold_nan_can_be_left_out_at_the_ends(trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    whole = read_bvh(path)
+    path.write_text(re.sub(r"\S+\n$", "nan\n", path.read_text()))
+    last = whole.frames - 1
+    part = read_bvh(path, start=3, end=last)
+    assert part.tracked is None and np.allclose(part.world()[1], whole.world()[1][3:last])
+    with pytest.raises(ValueError, match=rf"frame {last} holds NaN or infinity; .*--start and --end"):
+        read_bvh(path, start=3)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.5, 0.9, 0.99])

@@ -29,6 +29,35 @@ def test_what_can_be_read_back_holds_the_same_joints(name, smplx, duet: Scene, b
     assert (body.joints(got.scene) - body.joints(duet)).abs().max() < 1e-3
 
 
+@pytest.mark.parametrize(("name", "smplx"), [("a.npz", False), ("a.npz", True), ("a.bvh", False)])
+def test_a_part_is_read_by_the_frames_of_the_file_itself(name, smplx, duet: Scene, body: Body, tmp_path: Path):
+    written = formats.write(duet, tmp_path / name, body, smplx=smplx)
+    got = formats.read(written, options=formats.Reading(start=2, end=9, fps=15.0))
+    assert (got.scene.fps, got.scene.frames) == (15.0, 4)
+    assert (body.joints(got.scene) - body.joints(duet)[:, 2:9:2]).abs().max() < 1e-3
+    T = duet.frames
+    assert formats.read(written, options=formats.Reading(start=T - 1)).scene.frames == 1
+    for start, end, said in (
+        (T, None, f"holds {T} frames, so start {T} is behind them; give --start {T - 1} or less"),
+        (0, T + 1, f"so end {T + 1} is behind them"),
+        (-1, None, "start -1: expected 0 or more"),
+        (4, 4, "start 4, end 4: expected 0 or more, and an end after the start"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            formats.read(written, options=formats.Reading(start=start, end=end))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".bvh"])
+def test_files_of_two_rates_have_no_part_in_common(suffix: str, duet: Scene, body: Body, tmp_path: Path):
+    """A number of frames is another moment in each."""
+    one = duet.replace(present=torch.tensor([[True, False]])).people()
+    written = formats.write(one, tmp_path / f"a{suffix}", body)
+    written += formats.write(one.replace(fps=60.0), tmp_path / f"b{suffix}", body)
+    with pytest.raises(ValueError, match="--start and --end count frames, so cut each with magnet export"):
+        formats.read(written, options=formats.Reading(start=2, fps=30.0, trim=True))
+    assert formats.read(written, options=formats.Reading(fps=30.0, trim=True)).scene.agents == 2
+
+
 @pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s not in (".mp4", ".fbx")])
 def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_path: Path):
     if suffix in formats.USD:

@@ -343,7 +343,23 @@ def test_a_rest_pose_in_the_first_frame_spoils_none_of_the_others(truth: Truth, 
     off = (body.joints(found.scene)[:, 1:] - body.joints(plain.scene)).norm(dim=-1)
     assert off.max() < 0.03, off.amax(dim=(0, 2, 3))
     assert "everything jumps to frame 1 (a rest pose" in str(found.sources[0])
+    assert "leave it out, --start 1" in str(found.sources[0])
     assert "jumps" not in str(plain.sources[0])
+    without = load_bvh(led, body, start=1)
+    assert without.scene.frames == plain.scene.frames and "jumps" not in str(without.sources[0])
+    assert (body.joints(without.scene) - body.joints(plain.scene)).norm(dim=-1).max() < 1e-4
+
+
+def test_where_everything_jumps_again_and_again_nothing_is_to_be_left_out(duet: Scene, body: Body, tmp_path: Path):
+    """Poses that are held, as in a first pass of an animation, or takes behind each other."""
+    poses = duet.permute_agents(torch.tensor([0])).frames_at(torch.arange(30) // 8 % 2 * 3)
+    far = poses.T_world_root.clone()
+    far[:, :, :, 0, 3] += (torch.arange(30) // 8).float()[:, None]
+    (path,) = save_bvh(poses.replace(T_world_root=far), tmp_path / "held.bvh", body)
+    said = str(load_bvh(path, body).sources[0])
+    assert "everything jumps to frames 8, 16, 24 (stepped keys, or cuts?" in said and "leave it out" not in said
+    said = str(load_bvh(path, body, start=10, end=22).sources[0])
+    assert "jumps to frame 16 (a cut?): keep one part, --end 16 or --start 16" in said, "numbers are the file's"
 
 
 def test_a_single_frame_is_enough(truth: Truth, body: Body, tmp_path: Path):

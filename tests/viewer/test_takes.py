@@ -24,6 +24,12 @@ def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path,
     assert {each.label for each in found} == {"dance · 1", "dance · 2"}
 
 
+def test_a_part_of_a_file_is_shown(tmp_path: Path, duet: Scene, body: Body) -> None:
+    path = duet.save(tmp_path / "dance.npz")
+    found, _ = read_takes([path], body, start=2, end=6)
+    assert torch.equal(found[0].scene.T_world_root, duet.slice(2, 6).T_world_root)
+
+
 def test_smplx_files_are_shown_where_they_were_written_from(tmp_path: Path, duet: Scene, body: Body) -> None:
     path = save_smplx(duet, tmp_path / "dance.npz", body)[0]
     found, _ = read_takes([path], body)
