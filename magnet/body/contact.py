@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from magnet.body.capsules import capsule_segments
+from magnet.body.base import Body
+from magnet.body.capsules import CAPSULES, capsule_segments
 from magnet.body.energy import BEYOND, hand_points
+from magnet.body.indices import pairs_of
 from magnet.body.joints import TOES
-from magnet.motion.scene import FPS
+from magnet.motion.runs import true_runs
+from magnet.motion.scene import FPS, Scene
 
 FOREARMS = (7, 8)
 """Capsules that may cross: people who hold hands or link arms do not collide."""
@@ -24,6 +29,9 @@ DEEP = 0.10
 
 WITHIN = 0.20
 """Metres between the middles of two hands under which they are in contact."""
+
+REACH = 2.2
+"""Metres between pelvises beyond which no two people touch, nearly: with both arms stretched out."""
 
 STANDING = (0.05, 0.05)
 """Height in metres under which a toe stands, speed in m/s above which a standing toe slides."""
@@ -100,6 +108,72 @@ def deepest(joints: Tensor, partner: Tensor) -> Tensor:
     every = depth.amax(dim=(1, 2))
     depth[:, ARMS, ARMS] = 0.0
     return torch.stack([every, depth.amax(dim=(1, 2)), arms], dim=-1)
+
+
+def depth_between(scene: Scene, body: Body, fixed: Tensor | None = None) -> Tensor:
+    """How deep two people are in each other at most, forearm on forearm apart. -> (B, T) metres
+
+    fixed: (P,), (T, P) or (B, T, P) bool; two who are both fixed do not count.
+    """
+    joints, (b, t, one, other) = _near(scene, body)
+    if fixed is not None:
+        still = fixed.expand(joints.shape[:3])
+        free = ~(still[b, t, one] & still[b, t, other])
+        b, t, one, other = (each[free] for each in (b, t, one, other))
+    depth = joints.new_zeros(scene.scenes * scene.frames)
+    found = deepest(joints[b, t, one], joints[b, t, other])[:, 0]
+    return depth.scatter_reduce(0, b * scene.frames + t, found, "amax").view(scene.scenes, scene.frames)
+
+
+class Overlap(NamedTuple):
+    """A limb of one person that is in a limb of another for some frames, `start` to `last`, and how deep at most."""
+
+    scene: int
+    start: int
+    last: int
+    one: int
+    limb: str
+    other: int
+    other_limb: str
+    depth: float  # metres
+
+    def __str__(self) -> str:
+        when = f"frame {self.start}" if self.start == self.last else f"frames {self.start}-{self.last}"
+        limbs = f"{self.limb} of {self.one} in {self.other_limb} of {self.other}"
+        return f"{limbs}, {when}, {100 * self.depth:.1f} cm"
+
+
+def overlaps(scene: Scene, body: Body, over: float = TOUCH) -> list[Overlap]:
+    """Limbs that are deeper in each other than `over` metres, the deepest first; forearm on forearm apart.
+
+    A frame that is not valid is none.
+    """
+    joints, (b, t, one, other) = _near(scene, body)
+    if scene.valid is not None:
+        b, t, one, other = (each[scene.valid.to(b.device)[b, t]] for each in (b, t, one, other))
+    depth = penetration_depth(joints[b, t, one], joints[b, t, other], touch=over)
+    place: dict[tuple[int, int, int, int, int], dict[int, float]] = {}
+    for n, i, k in (depth > over).nonzero().tolist():
+        who = int(b[n]), int(one[n]), i, int(other[n]), k
+        place.setdefault(who, {})[int(t[n])] = float(depth[n, i, k])
+    found = []
+    for (number, first, i, second, k), frames in place.items():
+        names = CAPSULES[i].name, CAPSULES[k].name
+        for start, stop in true_runs([frame in frames for frame in range(scene.frames)]):
+            most = max(frames[frame] for frame in range(start, stop))
+            found.append(Overlap(number, start, stop - 1, first, names[0], second, names[1], most))
+    return sorted(found, key=lambda overlap: -overlap.depth)
+
+
+def _near(scene: Scene, body: Body) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Joints (B, T, P, 22, 3), and b, t, p, q of all people who are present and near enough to touch. (M,) each"""
+    joints = body.joints(scene)
+    first, second = pairs_of(scene.agents, joints.device)
+    pelvis = joints[..., 0, :]
+    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < REACH
+    both = (scene.present[:, first] & scene.present[:, second])[:, None]
+    b, t, pair = (near & both).nonzero(as_tuple=True)
+    return joints, (b, t, first[pair], second[pair])
 
 
 def hand_distance(joints: Tensor, partner: Tensor, beyond: float = BEYOND) -> Tensor:

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from magnet.body.apart import APART, Apart, kept_apart
+from magnet.body.apart import APART, Apart, eased, kept_apart
 from magnet.body.base import Body
+from magnet.body.contact import depth_between
 from magnet.body.drift import moved_over_ground, undrifted
+from magnet.body.energy import CONTACT
 from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
 from magnet.body.indices import pairs_of
 from magnet.body.jumps import unjumped
@@ -30,6 +32,18 @@ UPRIGHT = 15.0
 
 POSES = 2400
 """Poses that are corrected together: what is computed of them stays in the processor's caches."""
+
+STUBBORN = Settle(inner=40, bend=3000.0, stand=30.0, hold=3.0, hard=80.0)
+"""How a scene is corrected again around frames in which people stay deep: limbs that cross within two frames weigh
+less than smoothness otherwise. The rest weighs more as well, so that feet and hands do not pay, and what is bent is
+bent more smoothly still."""
+
+STAYS = 0.005
+"""Metres over `Contact.measured` from which on depth has stayed."""
+
+AROUND = 30
+"""Frames before and after such frames that are corrected again, and as many more over which that fades: standing feet
+are elsewhere in the two corrections, so that a quick change between them would make feet slide."""
 
 LET_GO = 0.10
 """Metres that people may be moved apart before their held hands are let go."""
@@ -60,6 +74,9 @@ def repaired(
 ) -> Scene:
     """A repaired scene: people who are deep in each other are moved apart, then poses are corrected.
 
+    Depth, held hands and standing feet are wishes that are weighed against each other and against smoothness. Where
+    depth stays, poses are corrected again with more weight on it.
+
     Frames that are not valid are no motion: each stretch of valid ones is repaired by itself. Contacts are read from
     the scene: hands within 20 cm hold each other, low toes slower than `slides` stand, and who is in the air without
     falling floats.
@@ -70,7 +87,7 @@ def repaired(
         how: `light` or `firm`, see `CONTACT`; or `hold`: as `firm`, and hands that met go on holding
             (`magnet.body.holding.lasting_holds`).
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; they come back bit-identical.
-        settle: how poses are corrected.
+        settle: how poses are corrected; None: by `Settle`, and where depth stays by `STUBBORN`.
         begun: the motion continues a past that stays, so corrections grow from 0.
         slides: m/s below which a low toe is meant to stand.
         drifting: first bring down who is far from the floor all the time (`grounded`), and stop people who slide over
@@ -88,11 +105,37 @@ def repaired(
     seen = scene.frames_at(few).replace(fps=scene.fps / every)
     stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., few, :]
     offset = settling(seen, body, how, stay, settle, begun, slides=slides)
+    if settle is None:
+        offset = pressed(seen, body, offset, how, stay, begun, slides)
     if every > 1:
         offset = between_frames(offset, few, scene.frames)
     if fixed is not None:
         offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
     return corrected(scene, offset)
+
+
+def pressed(
+    scene: Scene, body: Body, offset: Tensor, how: str, fixed: Tensor | None, begun: bool, slides: float
+) -> Tensor:
+    """The correction with that of `STUBBORN` around frames in which it leaves people deep. -> (B, T, P, DOFS)
+
+    A scene in which that does not help keeps its own. Arguments as for `repaired`; offset (B, T, P, DOFS).
+    """
+    depth = depth_between(corrected(scene, offset), body, fixed)
+    stays = depth > CONTACT[FIRM.get(how, how)].measured + STAYS
+    deep = stays.any(dim=1).nonzero()[:, 0]
+    if not len(deep):
+        return offset
+    few, still = scene.select(deep), fixed
+    if still is not None and still.ndim == 3 and len(still) == scene.scenes:
+        still = still[deep]
+    again = settling(few, body, how, still, STUBBORN, begun, slides=slides)
+    share = eased(stays[deep].to(again), AROUND)
+    again = torch.lerp(offset[deep], again, share[..., None, None])
+    better = depth_between(corrected(few, again), body, still).amax(dim=1) < depth[deep].amax(dim=1)
+    offset = offset.clone()
+    offset[deep[better]] = again[better]
+    return offset
 
 
 def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:

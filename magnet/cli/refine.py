@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
+from magnet.cli.data_shown import show_some
 from magnet.cli.errors import CommandError
 
 if TYPE_CHECKING:
@@ -19,10 +20,11 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 IN is a scene (.npz of magnet or of SMPL-X) or a .bvh file; several are several people of one world. OUT's suffix says
-what is written, as for `magnet export`. Roots, legs and arms are corrected, smoothly and as little as they can be:
-nobody is in anybody's body or in their own, hands that were together stay together, low toes stand still, whoever is in
-the air without falling comes down, soles are not under the floor, and nobody jumps up or down within a frame. The table
-says how it was and how it is.
+what is written, as for `magnet export`. Roots, legs and arms are corrected, smoothly and as little as they can be, so
+that nobody is in anybody's body or in their own, hands that were together stay together, low toes stand still, whoever
+is in the air without falling comes down, soles are not under the floor, and nobody jumps up or down within a frame.
+These are goals, weighed against each other: the table says how it was and how it is, and limbs that stay over 5 cm in
+each other are named below it.
 
 for example:
   magnet refine demo/quartet.npz apart.npz
@@ -106,6 +108,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         refined = repaired(got.scene, got.body, how, fixed, slides=options.slides)
     for title, scene in (("before", before), ("after", refined)):
         print(f"{title:7}{told(scene, got.body)}")
+    show_some([f"still over 5 cm: {each}" for each in left(refined, got.body)], NAMED, ", less deep")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
         plot = Path(options.plot)
@@ -138,6 +141,17 @@ def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
     if len(betas) < int(people.max()):
         raise CommandError(f"--shapes {named}: holds {len(betas)} people, expected {int(people.max())} or more")
     return betas[(scene.present.cumsum(dim=1) - 1).clamp_min(0)]
+
+
+NAMED = 5
+"""Limbs that are named where they stay in each other."""
+
+
+def left(scene: Scene, body: Body) -> list[str]:
+    """Limbs that are over 5 cm in each other, by person and frames, the deepest first."""
+    from magnet.body.contact import overlaps
+
+    return [f"scene {each.scene}: {each}" if scene.scenes > 1 else str(each) for each in overlaps(scene, body)]
 
 
 def told(scene: Scene, body: Body) -> str:

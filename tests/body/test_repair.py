@@ -14,13 +14,14 @@ from magnet.body.contact import deepest
 from magnet.body.drift import drift, undrifted
 from magnet.body.energy import hand_points
 from magnet.body.fit import clearance
-from magnet.body.joints import FEET, TOES
-from magnet.body.repair import grounded, repaired
+from magnet.body.joints import FEET, SPINE3, TOES
+from magnet.body.repair import grounded, pressed, repaired
 from magnet.body.settle import DOFS, Settle, corrected, correction, jacobian
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
 from magnet.metrics import hand_distance
 from magnet.motion.frames import rigid
+from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.synthesis import synthesize
 from tests.cases import some_slow
@@ -262,3 +263,28 @@ def test_scenes_of_other_rates_are_corrected_as_smoothly(handshake: Scene) -> No
     assert float(shift[40:300].mean()) == pytest.approx(-0.15, abs=0.03)
     assert max(abs(float(b - a)) for a, b in pairwise(shift)) < 0.01
     assert cat_time([four, four]).frames == 2 * four.frames
+
+
+def swinging(frames: int) -> Scene:
+    """Two who stand with an arm stretched out; one swings it through the other's within some frames in the middle."""
+    scene, angle = arms_out(1.0, 0.3, frames), 0.2 + ((torch.arange(frames) - frames / 2) / 3 + 0.5).clamp(0, 1)
+    body_rot = scene.body_rot.clone()
+    body_rot[0, :, 1, SPINE3 - 1] = from_rotvec(angle[:, None] * torch.tensor([0.0, -1.0, 0.0]))
+    return scene.replace(body_rot=body_rot)
+
+
+def test_depth_that_a_correction_leaves_for_a_moment_is_corrected_again_around_it() -> None:
+    """Limbs that cross within two or three frames weigh less than what is smooth."""
+    scene = swinging(200)
+    left = correction(scene, BODY, Wishes.of(scene, BODY), settle=Settle(hard=1e-4))
+    assert float(depths(corrected(scene, left)).max()) > 0.065
+    again = pressed(scene, BODY, left, "firm", None, False, 0.0)
+    assert float(depths(corrected(scene, again)).max()) < 0.05
+    assert torch.equal(again[:, :30], left[:, :30]) and torch.equal(again[:, -30:], left[:, -30:])
+    kept = torch.tensor([True, True])
+    assert pressed(scene, BODY, left, "firm", kept, False, 0.0) is left, "who does not move is not asked to"
+
+
+def test_where_nothing_stays_deep_a_scene_is_corrected_once(handshake: Scene) -> None:
+    once = repaired(handshake, BODY, settle=Settle())
+    assert torch.equal(repaired(handshake, BODY).body_rot, once.body_rot)

@@ -10,6 +10,7 @@ import torch
 
 from magnet import cli
 from magnet.body import load_body
+from magnet.body.contact import depth_between, overlaps
 from magnet.cli.refine import told
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -48,6 +49,23 @@ def test_people_are_out_of_each_other_afterwards_and_the_table_says_so(crowded: 
     made = Scene.load(out)
     assert torch.equal(made.body_rot, crowded.body_rot), "poses stay"
     assert torch.allclose(made.T_world_root[..., 1, 3], crowded.T_world_root[..., 1, 3]), "and heights"
+
+
+def test_limbs_that_stay_in_each_other_are_named_with_people_and_frames(
+    crowded: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Arms may lie on arms where poses are kept."""
+    scene, out = crowded.save(tmp_path / "crowded.npz"), tmp_path / "apart.npz"
+    assert cli.main(["refine", str(scene), str(out), "--poses", "keep"]) == 0
+    named = [line for line in capsys.readouterr().out.splitlines() if line.startswith("still over 5 cm: ")]
+    made, body = Scene.load(out), load_body()
+    found = overlaps(made, body)
+    assert found and named[0] == f"still over 5 cm: {found[0]}"
+    assert re.search(r"arm of 0 in (left|right) (upper arm|forearm) of 1, frames? \d+(-\d+)?, \d\.\d cm$", named[0])
+    deep = depth_between(made, body)[0]
+    assert float(deep.max()) == pytest.approx(found[0].depth, abs=1e-6)
+    frames = {frame for each in found for frame in range(each.start, each.last + 1)}
+    assert frames == set((deep > 0.05).nonzero()[:, 0].tolist())
 
 
 def test_who_is_kept_does_not_move(crowded: Scene, tmp_path: Path) -> None:
