@@ -228,7 +228,8 @@ def run_check(given: argparse.Namespace) -> int:
     if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
     show_problems(found.problems)
-    print(f"{len(found.problems)} problems" if found.problems else "all assertions hold")
+    count = len(found.problems)
+    print(f"{count} problem{'s' * (count > 1)}" if count else "all assertions hold")
     return FAILED if found.problems else 0
 
 

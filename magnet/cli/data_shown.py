@@ -131,7 +131,7 @@ def show_some(lines: Sequence[str], most: int, more: str, file: TextIO | None = 
 def show_skipped(skipped: list[tuple[str, str]]) -> None:
     """Takes that were not used, and why."""
     if skipped:
-        print(f"skipped {len(skipped)} takes:")
+        print(f"skipped {len(skipped)} take{'s' * (len(skipped) > 1)}:")
         lines = [f"  {take}: {why}" for take, why in skipped]
         show_some(lines, SKIPPED_SHOWN, ", all of them in the store's manifest.json")
 

@@ -76,7 +76,7 @@ def test_a_check_finds_one_changed_byte(copy, capsys, which):
     file.write_bytes(content)
     assert cli.main(["data", "check", "store", "--picture", "none"]) == 1
     said = capsys.readouterr()
-    assert f"{file.name} is damaged: its checksum" in said.err and "1 problems" in said.out
+    assert f"{file.name} is damaged: its checksum" in said.err and "1 problem\n" in said.out
 
 
 def check_options() -> list[list[str]]:
@@ -142,7 +142,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
     words = ["prepare", "dd100", "--root", "dl", "--out", "store", "--body", "dl/body.npz", "--workers", "1"]
     assert cli.main(["data", *words]) == 0
     said = capsys.readouterr().out
-    assert "skipped 1 takes:" in said and files[0].name in said and "1 were skipped" in said
+    assert "skipped 1 take:" in said and files[0].name in said and "1 were skipped" in said
     for file in files:
         file.write_bytes(b"")
     assert cli.main(["data", *words]) == 2
@@ -255,6 +255,28 @@ def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(cop
     assert cli.main(["data", "check", "dl", "--picture", "none", "--workers", "1", "--body", "dl/body.npz"]) == 1
     said = capsys.readouterr()
     assert "takes broke an assertion" in said.err and "all assertions hold" not in said.out
+
+
+def test_a_recording_too_short_to_hold_parts_out_is_no_broken_one(tmp_path, monkeypatch, capsys):
+    """It trains; what a beginner is to do is said in seconds."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", "bvh", "people", "--takes", "1", "--frames", "90"]) == 0
+    (name,) = {path.stem.rpartition("_")[0] for path in (tmp_path / "people").glob("*.bvh")}
+    check = ["data", "check", "people", "--picture", "none", "--workers", "1"]
+    capsys.readouterr()
+    assert cli.main(check) == 0
+    said = capsys.readouterr()
+    told = (
+        f"{name} is 3.0 s long; to hold out a part of 1 s it must be 10 s to validate and 3.4 s to test: record longer"
+    )
+    assert told in said.out and "skipped 2 takes" in said.out and "PROBLEM" not in said.err
+    Path("all.txt").write_text(f"{name} train\n")
+    assert cli.main([*check, "--splits", "all.txt"]) == 0
+    assert "held out" not in capsys.readouterr().out
+    file = min((tmp_path / "people").glob("*.bvh"))
+    file.write_bytes(file.read_bytes()[:2000])
+    assert cli.main(check) == 1
+    assert "record longer" not in capsys.readouterr().out
 
 
 def test_the_store_may_be_named_last_in_place_of_out(made, tmp_path, capsys):

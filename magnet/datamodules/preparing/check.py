@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,7 +20,8 @@ from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Prog
 from magnet.datamodules.preparing.pack import split_counts
 from magnet.datamodules.preparing.prepare import absent_note, select_takes
 from magnet.datamodules.reading.fields import listing
-from magnet.datamodules.reading.recording import DataError, Reader
+from magnet.datamodules.reading.own import FEW, OwnReader, seconds_needed
+from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import StoreError, StoreReader, StoreSplit, body_hash
 from magnet.datamodules.store.rows import SCALE, scene_of
 from magnet.export.picture import contact_sheet
@@ -30,6 +32,8 @@ UNIT = 2.0
 """By how much a stored quaternion's length may differ from the scale: rounding to whole numbers moves it by one."""
 PELVIS = (-1.0, 6.0)
 """Metres over the floor that pelvises are found at, climbing and lifting included."""
+HELD_OUT: dict[Split | None, str] = {"val": "to validate", "test": "to test"}
+"""What parts of a recording are held out for."""
 SHOWN, SHOWN_FRAMES = 4, 120
 """Clips in the picture, and frames of each."""
 
@@ -46,12 +50,13 @@ class CheckReport:
     notes: list[str] = field(default_factory=list)
     scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
 
-    def count_skipped(self, takes: int) -> None:
-        """Skipped ones of so many takes are a problem."""
+    def count_skipped(self, takes: int, short: int = 0) -> None:
+        """Skipped ones of so many takes are a problem, but for those that are only short."""
+        broken = len(self.skipped) - short
         if not self.splits:
             self.problems.append(f"none of {takes} takes can be used")
-        elif self.skipped:
-            self.problems.append(f"{len(self.skipped)} of {takes} takes broke an assertion; they are listed above")
+        elif broken:
+            self.problems.append(f"{broken} of {takes} takes broke an assertion; they are listed above")
 
 
 def noted(note: str, takes: list[str]) -> str:
@@ -255,8 +260,42 @@ def check_download(
         people += part.people
     found.splits = {split: split_counts(len(names), *each) for split, (names, *each) in clips.items()}
     found.notes += [noted(note, takes) for note, takes in notes.items()]
-    found.count_skipped(len(takes))
+    failed = {name for name, _ in found.skipped}
+    short, said = short_parts(reader, [take for take in takes if take.name in failed], job.canonicalize.min_frames)
+    found.notes += said
+    found.count_skipped(len(takes), short)
     return found
+
+
+def short_parts(reader: Reader, takes: Sequence[Take], least: int) -> tuple[int, list[str]]:
+    """How many of these takes are parts held out of a recording that is too short for it, and what to do.
+
+    Args:
+        reader: whose takes they are.
+        takes: those that cannot be used.
+        least: frames of a clip.
+
+    Returns:
+        The number of them, and a sentence for each recording.
+    """
+    if not isinstance(reader, OwnReader) or not reader.in_time:
+        return 0, []
+    lacking: dict[tuple[str, float], list[Split]] = {}
+    for take in takes:
+        with suppress(DataError, OSError):
+            scene, part, whole, seconds = reader.part_of(take)
+            if part in HELD_OUT and round(seconds * FPS) < least:
+                lacking.setdefault((scene, whole), []).append(part)
+    said = []
+    for (scene, whole), parts in lacking.items():
+        lengths = {part: math.ceil(10 * seconds_needed(part, least / FPS)) / 10 for part in parts}
+        needed = " and ".join(f"{seconds:g} s {HELD_OUT[part]}" for part, seconds in lengths.items())
+        said.append(
+            f"{scene} is {whole:.1f} s long; to hold out a part of {least / FPS:g} s it must be {needed}: record "
+            f"longer, or {FEW} takes or more, of which whole ones are held out; or train on all of it: --splits FILE "
+            f"with the line '{scene} train'"
+        )
+    return sum(map(len, lacking.values())), said
 
 
 # -- the picture -------------------------------------------------------------------------------

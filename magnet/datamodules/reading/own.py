@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Generic, Literal, Protocol, Self, TypeVar
+from typing import ClassVar, Generic, Literal, NamedTuple, Protocol, Self, TypeVar
 
 from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.reading.arrays import hashed_split
@@ -47,6 +47,15 @@ class PersonTrack(Protocol):
 
 
 T = TypeVar("T", bound=PersonTrack)
+
+
+class PartOf(NamedTuple):
+    """A part of a scene, None: all of it, with the seconds of the scene and of the part before anything is cut out."""
+
+    scene: str
+    part: Split | None
+    whole: float
+    seconds: float
 
 
 class OwnReader(Reader, Generic[T]):
@@ -206,6 +215,29 @@ class OwnReader(Reader, Generic[T]):
     def read(self, take: Take) -> Recording:
         """The scene, or the part of it that the take is."""
         group, part = self._meant(take)
+        tracks, names, notes = self._people(group)
+        frames = min(track.frames for track in tracks)
+        if len({track.frames for track in tracks}) > 1:
+            lengths = ", ".join(f"{n or p} {t.frames}" for p, (n, t) in enumerate(zip(names, tracks, strict=True)))
+            notes.append(f"unequal numbers of frames ({lengths}), cut to the shortest")
+        start, stop = (0, frames) if part is None else span(part, frames, tracks[0].fps)
+        tracks = [track.slice(start, stop) for track in tracks]
+        return self.recording(group.scene, tracks, names, notes)
+
+    def part_of(self, take: Take) -> PartOf:
+        """Which part of which scene a take is, and how long both are.
+
+        Raises:
+            DataError: a file of it that cannot be read.
+        """
+        group, part = self._meant(take)
+        tracks, _, _ = self._people(group)
+        frames, fps = min(track.frames for track in tracks), tracks[0].fps
+        start, stop = (0, frames) if part is None else span(part, frames, fps)
+        return PartOf(group.scene, part, frames / fps, (stop - start) / fps)
+
+    def _people(self, group: SceneFiles) -> tuple[list[T], list[str], list[str]]:
+        """Everybody in a scene from when the last of them begins, their names, and what should be known of it."""
         tracks: list[T] = []
         names: list[str] = []
         starts: list[float] = []
@@ -219,14 +251,7 @@ class OwnReader(Reader, Generic[T]):
         if group.alone:
             notes.append("named like one of several people, but no other file goes with it")
         tracks = self._one_rate(tracks, group, notes)
-        tracks = _from_latest(tracks, starts, group)
-        frames = min(track.frames for track in tracks)
-        if len({track.frames for track in tracks}) > 1:
-            lengths = ", ".join(f"{n or p} {t.frames}" for p, (n, t) in enumerate(zip(names, tracks, strict=True)))
-            notes.append(f"unequal numbers of frames ({lengths}), cut to the shortest")
-        start, stop = (0, frames) if part is None else span(part, frames, tracks[0].fps)
-        tracks = [track.slice(start, stop) for track in tracks]
-        return self.recording(group.scene, tracks, names, notes)
+        return _from_latest(tracks, starts, group), names, notes
 
     def _meant(self, take: Take) -> tuple[SceneFiles, Split | None]:
         if take.name in self.groups:
@@ -262,6 +287,16 @@ def span(part: Split, frames: int, fps: float) -> tuple[int, int]:
     test = max(frames - round(tested), min(2, frames - 1))
     val = max(test - max(1, round(VALIDATED * frames)), min(1, test))
     return {"train": (0, val), "val": (val, test), "test": (test, frames)}[part]
+
+
+def seconds_needed(part: Split, least: float) -> float:
+    """Seconds of a scene of which a validating or testing part is at least so long; see `span`.
+
+    >>> seconds_needed("val", 1.0), round(seconds_needed("test", 1.0), 1), round(seconds_needed("test", 6.0), 1)
+    (10.0, 3.3, 40.0)
+    """
+    share = VALIDATED if part == "val" else MOST if least <= LEAST else HELD
+    return least / share
 
 
 def _from_latest(tracks: list[T], starts: list[float], group: SceneFiles) -> list[T]:
