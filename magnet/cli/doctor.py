@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns 0, or 1 where something is wrong; what is only missing is no fault."""
     parser = PlainParser("doctor", __doc__)
     parser.parse_args(list(arguments))
-    found = [*packages(), *devices(), *extras(), *others(), *files()]
+    found = [*packages(), *devices(), *extras(), *blender(), *others(), *files()]
     wide = max(len(finding.what) for finding in found)
     print(f"magnet {__version__} in {Path(__file__).parents[1]}")
     room = ""
@@ -141,6 +141,27 @@ def extras() -> Iterator[Finding]:
         else:
             there = ", ".join(f"{each} {version}" for each, version in versions.items())
             yield Finding("extras", name, "ok", f"{extra.adds} ({there})")
+
+
+def blender() -> Iterator[Finding]:
+    """What writes .fbx."""
+    if version_of("torch") is None:
+        return
+    from magnet.export.fbx import VARIABLE
+    from magnet.export.fbx import blender as command
+
+    what = "magnet export scene.fbx; .glb needs nothing"
+    try:
+        program = command()[0]
+    except ImportError:
+        advice = f"pip install bpy, or install Blender so that the command blender runs, or set {VARIABLE}"
+        yield Finding("extras", "blender", "missing", what, advice)
+        return
+    if shutil.which(program) is None:
+        advice = f"set {VARIABLE} to a Python that has bpy, or unset it"
+        yield Finding("extras", "blender", "wrong", f"{VARIABLE} is {program}, which is no program", advice)
+        return
+    yield Finding("extras", "blender", "ok", f"{what} ({program})")
 
 
 GROUPS = ("magnet.tasks", "magnet.datamodules", "magnet.metrics")

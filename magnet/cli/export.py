@@ -45,7 +45,9 @@ def parser() -> argparse.ArgumentParser:
     add("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
     add("--each", action="store_true", help="with --smplx, a file per person: out_0.npz ..., as most tools expect")
     add("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
-    add = options.add_argument_group("bones of .glb, .fbx and .usd (defaults: smplx, floor, scene)").add_argument
+    add = options.add_argument_group(
+        "bones of .glb, .fbx and .usd (defaults: smplx, floor, scene); .bvh takes names"
+    ).add_argument
     names = "SMPL-X's, those of VRM's humanoid, which Unity knows as well, or Mixamo's"
     add("--names", choices=("smplx", "vrm", "mixamo"), default="smplx", help=names)
     root = "a bone on the floor that carries where somebody walks, or none"
@@ -129,7 +131,7 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
     for flag, plain, takes in (
         ("unit", "m", (".bvh",)),
         ("smplx", False, (".npz",)),
-        ("names", "smplx", bones),
+        ("names", "smplx", (".bvh", *bones)),
         ("root", "floor", bones),
         ("clips", "scene", (".glb",)),
     ):

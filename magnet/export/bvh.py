@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.body.joints import HEAD, JOINT_NAMES, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
+from magnet.body.joints import HEAD, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
+from magnet.export.bones import Names, bone_names
 from magnet.motion.scene import Scene, require_body, require_one
 
 Unit = Literal["m", "cm"]
@@ -27,20 +28,21 @@ TIPS: dict[int, tuple[float, float, float]] = {
 """Metres from a leaf joint to its End Site, which only sets the drawn length of the last bone."""
 
 
-def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") -> list[Path]:
+def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", names: Names = "smplx") -> list[Path]:
     """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ... by slot, or the path itself for one.
 
-    All people keep their places in the scene's world, y up. Joints have SMPL-X's names; the root's position is the
-    pelvis joint in the world, its OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
+    All people keep their places in the scene's world, y up. The root's position is the pelvis joint in the world, its
+    OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
 
     Args:
         unit: unit of lengths, which the format does not state. Blender expects metres, MotionBuilder centimetres.
+        names: of joints: SMPL-X's, those of VRM's humanoid, or Mixamo's.
 
     Returns:
         The paths written, in the order of the slots.
 
     Raises:
-        ValueError: more than one scene, nobody present, another body's, or no such unit.
+        ValueError: more than one scene, nobody present, another body's, or no such unit or names.
 
     >>> import tempfile
     >>> from magnet.body import load_body
@@ -72,7 +74,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m") ->
             for place, angles in zip(position, degrees, strict=True)
         ]
         tips = {joint: PER_METRE[unit] * np.array(tip) for joint, tip in TIPS.items()}
-        each.write_text(bvh_text(JOINT_NAMES, PARENTS, offsets, tips, ROTATIONS, rows, scene.fps))
+        each.write_text(bvh_text(bone_names(names), PARENTS, offsets, tips, ROTATIONS, rows, scene.fps))
         written.append(each)
     return written
 

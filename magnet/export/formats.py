@@ -235,7 +235,9 @@ def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
 
 WRITTEN: dict[str, Format] = {
     ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
-    ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit)),  # a skeleton a person, one file each
+    ".bvh": Format(
+        lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit, names=o.bones.names)
+    ),  # a skeleton a person, one file each
     ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
     ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)], ready=blender),  # the same, by Blender
     **{suffix: Format(_write_usd, ready=require_usd) for suffix in USD},
@@ -291,7 +293,7 @@ def write(
         style: how pictures show people: `body`, `light`, `capsules` or `skeleton`.
         title: of pictures.
         progress: True for a bar while films are drawn, or a function called with (done, all).
-        bones: names and hierarchy of bones in GLB, FBX and USD.
+        bones: names and hierarchy of bones in GLB, FBX and USD; their names in BVH.
         size: pixels of a film's panel, width and height, even numbers.
         each: with smplx, a file per person: out_0.npz, out_1.npz ...
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from magnet import checkpoints, cli, plugins
 from magnet.cli import doctor
 from magnet.datamodules.registry import DATA
+from magnet.export import fbx
 from magnet.metrics.registry import METRICS
 from magnet.tasks.registry import TASKS
 
@@ -48,6 +50,22 @@ def test_what_is_missing_comes_with_advice(
     assert set(missing) - {"gpu"} == set(advised)
     assert 'pip install "magnet-motion[view]"' in advice and "export MAGNET_CMU" in advice
     assert re.search(r"ok +model duet +.*every hash right", above)
+
+
+def test_what_writes_fbx_is_named_with_its_place_or_with_advice(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "bpy", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv(fbx.VARIABLE, raising=False)
+    assert [(one.state, one.advice.partition(",")[0]) for one in doctor.blender()] == [("missing", "pip install bpy")]
+    monkeypatch.setenv(fbx.VARIABLE, str(tmp_path / "python"))
+    assert cli.main(["doctor"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(rf"WRONG +blender +{fbx.VARIABLE} is .*python, which is no program", said)
+    monkeypatch.setenv(fbx.VARIABLE, sys.executable)
+    assert [one.state for one in doctor.blender()] == ["ok"]
 
 
 def test_what_is_wrong_ends_with_an_error(

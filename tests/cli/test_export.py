@@ -42,7 +42,8 @@ def test_one_scene_of_several_becomes_one_file(stored: Path, capsys: pytest.Capt
     [
         ("glb", ["--unit", "cm"], "--unit: is for .bvh"),
         ("bvh", ["--smplx"], "--smplx: is for .npz"),
-        ("bvh", ["--names", "mixamo"], "--names: is for .glb, .fbx"),
+        ("csv", ["--names", "mixamo"], "--names: is for .bvh, .glb, .fbx"),
+        ("bvh", ["--root", "none"], "--root: is for .glb, .fbx"),
         ("usda", ["--clips", "person"], "--clips: is for .glb"),
     ],
 )

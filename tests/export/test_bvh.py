@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import load_bvh, save_bvh
+from magnet.export.bones import Names, bone_names
 from magnet.export.bvh import euler_zxy
 from magnet.export.bvh_read import read_bvh
 from magnet.motion.scene import Scene
@@ -178,6 +179,16 @@ def test_a_broken_file_is_named_with_what_is_wrong(message, trio: Scene, body: B
     with pytest.raises(ValueError, match=message) as error:
         read_bvh(path)
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("names", ["vrm", "mixamo"])
+def test_a_skeleton_of_other_names_comes_back_exactly(names: Names, trio: Scene, body: Body, tmp_path: Path):
+    """Written for programs that retarget by these."""
+    paths = save_bvh(trio, tmp_path / "trio.bvh", body, names=names)
+    assert sorted(read_bvh(paths[0]).names) == sorted(bone_names(names))
+    found = load_bvh(paths, body)
+    assert all(source.exact for source in found.sources)
+    assert (body.joints(found.scene) - body.joints(trio)).abs().max() < 1e-5
 
 
 def test_frames_that_hold_nan_can_be_left_out_at_the_ends(trio: Scene, body: Body, tmp_path: Path):
