@@ -32,7 +32,7 @@ UNIT = 2.0
 """By how much a stored quaternion's length may differ from the scale: rounding to whole numbers moves it by one."""
 PELVIS = (-1.0, 6.0)
 """Metres over the floor that pelvises are found at, climbing and lifting included."""
-HELD_OUT: dict[Split | None, str] = {"val": "to validate", "test": "to test"}
+HELD_OUT: dict[Split, str] = {"val": "to validate", "test": "to test"}
 """What parts of a recording are held out for."""
 SHOWN, SHOWN_FRAMES = 4, 120
 """Clips in the picture, and frames of each."""
@@ -284,7 +284,7 @@ def short_parts(reader: Reader, takes: Sequence[Take], least: int) -> tuple[int,
     for take in takes:
         with suppress(DataError, OSError):
             scene, part, whole, seconds = reader.part_of(take)
-            if part in HELD_OUT and round(seconds * FPS) < least:
+            if part is not None and part in HELD_OUT and round(seconds * FPS) < least:
                 lacking.setdefault((scene, whole), []).append(part)
     said = []
     for (scene, whole), parts in lacking.items():
