@@ -213,6 +213,8 @@ def one_in_another(scene: Scene) -> list[str]:
 
     from magnet.export.upright import WARNING
 
+    if scene.agents < 2:
+        return []
     moments = scene.frames_at(torch.linspace(0, max(scene.frames - 1, 0), min(scene.frames, MOMENTS)).long())
     pelvis = moments.T_world_root[..., :3, 3].float()  # (B, F, P, 3)
     both = moments.present[:, :, None] & moments.present[:, None]

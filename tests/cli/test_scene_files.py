@@ -13,6 +13,7 @@ import torch
 
 from magnet import cli
 from magnet.body import Body, load_body
+from magnet.cli.scene_files import one_in_another
 from magnet.export.bvh import save_bvh
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.motion.scene import Scene
@@ -84,6 +85,13 @@ def test_people_in_one_place_are_warned_of(folder: Path, capsys: pytest.CaptureF
     assert "warning: people 1 and 2 are in the same place throughout" in capsys.readouterr().out
     assert cli.main(["export", "duet.npz", "take.csv"]) == 0
     assert "warning" not in capsys.readouterr().out
+
+
+def test_a_scene_of_nobody_is_refused_in_a_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene.load("duet.npz")
+    scene.permute_agents(torch.zeros(0, dtype=torch.long)).save("nobody.npz")
+    assert len(refused(capsys, "export", "nobody.npz", "o.glb").splitlines()) == 1
+    assert one_in_another(Scene.load("nobody.npz")) == []
 
 
 @pytest.mark.parametrize("more", [[], ["--frames", "20"]])
