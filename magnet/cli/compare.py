@@ -50,7 +50,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     """
     given = parser().parse_args(list(arguments))
     if len(given.folders) > 2 or (len(given.folders) == 1 and not given.rows):
-        raise CommandError(f"got {len(given.folders)} folders, expected two, or one with --rows ROW ROW")
+        many = len(given.folders)
+        raise CommandError(f"got {many} folder{'s' * (many > 1)}, expected two, or one with --rows ROW ROW")
     both = [read(folder) for folder in (given.folders[0], given.folders[-1])]
     rows = tuple(given.rows or [next(iter(values.rows)) for _, values in both])
     for folder, row, (_, values) in zip((given.folders[0], given.folders[-1]), rows, both, strict=True):
@@ -111,8 +112,8 @@ def show(
     console.print(f"{names[0]} and {names[1]}, {len(common)} scenes of both ({units} independent)", style="bold")
     found = {each: compared(one, other, rows, each, results.column(each).better, REFERENCES[0]) for each in metrics}
     console.print(table(results, names, found))
-    lone = max(len(one.scenes), len(other.scenes)) - len(common)
-    notes = [f"{lone} scenes are in one of them alone and left out"] if lone else []
+    lone = len(set(one.scenes) ^ set(other.scenes))
+    notes = [f"{lone} scene{'s are' if lone > 1 else ' is'} in one of them alone and left out"] if lone else []
     facts = [(key, one.facts.get(key), other.facts.get(key)) for key in SAME]
     facts.append(("samples", samples(one, rows[0]), samples(other, rows[1])))
     notes += [

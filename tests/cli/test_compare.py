@@ -54,15 +54,16 @@ def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     one = results_in(tmp_path / "a", samples={"magnet": 1})
     text = said(capsys, one, results_in(tmp_path / "b", first=2, task="generation"))
     assert "10 scenes of both" in text
-    assert "2 scenes are in one of them alone" in text
+    assert "4 scenes are in one of them alone" in text, "the first two of one, the last two of the other"
     assert "not alike: task, joint_future and generation" in text
     assert "not alike: samples, 1 and 10" in text
+    assert "1 scene is in one of them alone" in said(capsys, one, results_in(tmp_path / "c", scenes=11))
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["a"], "got 1 folders, expected two, or one with --rows ROW ROW"),
+        (["a"], "got 1 folder, expected two, or one with --rows ROW ROW"),
         (["a", "nowhere"], "nowhere: has no results.json, expected a folder that magnet test or"),
         (["a", "old"], "old: has no scenes.json"),
         (["a", "--rows", "magnet", "nn"], "no row nn; there are magnet, NN. See a"),
