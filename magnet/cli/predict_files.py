@@ -73,7 +73,7 @@ def _names_files(arguments: Sequence[str]) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("predict", __doc__, EPILOG, inputs="*")
-    options.add_argument("--out", nargs="+", **scene_files.OUT)
+    options.add_argument("--out", nargs="+", action="extend", **scene_files.OUT)
     add = options.add_argument_group("what is sampled").add_argument
     add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
     add("--task.FIELD", metavar="VALUE", help="an option of the task")
@@ -111,6 +111,7 @@ def main(arguments: Sequence[str]) -> int:
     require_files(options.inputs)  # before anything else is asked for
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
+    scene_files.require_not_there(options.inputs, options.out)
     for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
         value = getattr(options, name)
         if value is not None and value < least:

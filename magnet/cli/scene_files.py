@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import glob
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -186,6 +187,33 @@ def require_inputs(inputs: Sequence[str], outs: Sequence[str]) -> None:
             f"--out {shlex.join(outs)}: takes all words behind it, so that nothing is left to read; files stand first, "
             f"then options: magnet predict {right}"
         )
+
+
+def require_not_there(inputs: Sequence[str], outs: Sequence[str]) -> None:
+    """Refuse files behind the first of --out that could be meant to be read: they are there, and it is not.
+
+    Where a command is given again, the first is there as well.
+
+    Raises:
+        CommandError: says how to write either.
+    """
+    from magnet.export import formats
+
+    first, *behind = outs
+    known = {*map(Path, inputs)}  # what is read is refused by name
+    there = [
+        out
+        for out in behind
+        if Path(out).suffix.lower() in formats.READ and Path(out).exists() and Path(out) not in known
+    ]
+    # People and scenes may have got a file each.
+    if not there or any(Path(first).parent.glob(f"{glob.escape(Path(first).stem)}*{Path(first).suffix}")):
+        return
+    others = [out for out in outs if out not in there]
+    raise CommandError(
+        f"--out {shlex.join(outs)}: {there[0]} is there, and would be written over; to read it, magnet predict "
+        f"{shlex.join([*inputs, *there])} --out {shlex.join(others)}; to write it anew, remove it or name it first"
+    )
 
 
 def require_each_once(inputs: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.checkpoints import FOLDER
+from magnet.cli.predict_files import parser
 from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats, save_bvh
 from magnet.export.npz import save_smplx
@@ -196,6 +197,14 @@ def test_the_seed_decides_and_several_kinds_are_written(duet, tmp_path, capsys) 
         assert f"seed {seed}" in text and all(f"written: {out}" in text for out in outs)
         made.append(Scene.load(outs[0]).body_rot)
     assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
+
+
+def test_out_may_be_said_twice() -> None:
+    assert parser().parse_intermixed_args(["a.bvh", "--out", "o.glb", "--out", "o.mp4", "p.npz"]).out == [
+        "o.glb",
+        "o.mp4",
+        "p.npz",
+    ]
 
 
 def test_a_crowd_is_composed_of_the_people_of_files(duet, tmp_path, capsys) -> None:

@@ -13,7 +13,8 @@ import torch
 
 from magnet import cli
 from magnet.body import Body, load_body
-from magnet.cli.scene_files import one_in_another
+from magnet.cli.errors import CommandError
+from magnet.cli.scene_files import one_in_another, require_not_there
 from magnet.export.bvh import save_bvh
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.motion.scene import Scene
@@ -346,3 +347,22 @@ def test_another_frame_rate_is_refused_by_file_and_key(rate: np.ndarray, folder:
     np.savez("amass.npz", **{**dict(np.load("one.npz")), "mocap_frame_rate": rate})
     with pytest.raises(ValueError, match=r"amass\.npz: mocap_frame_rate: expected one number"):
         load_smplx("amass.npz", body)
+
+
+@pytest.mark.parametrize("before", [["--people", "3"], ["take_1.bvh"]], ids=" ".join)
+def test_files_behind_a_new_out_are_not_written_over(
+    before: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = Path("take_0.bvh").read_bytes()
+    said = refused(capsys, "predict", *before, "--out", "z.glb", "take_0.bvh")
+    assert "take_0.bvh is there, and would be written over" in said and "take_0.bvh --out z.glb" in said
+    assert Path("take_0.bvh").read_bytes() == recorded
+
+
+@pytest.mark.parametrize("first", ["z.glb", "z_0.glb"])
+def test_a_command_may_be_given_again(first: str, folder: Path) -> None:
+    Path(first).touch()
+    require_not_there([], ["z.glb", "take_0.bvh"])
+    require_not_there([], ["take_0.bvh", "new.glb"])
+    with pytest.raises(CommandError, match=r"magnet predict a\.bvh take_0\.bvh --out y\.glb y\.mp4;"):
+        require_not_there(["a.bvh"], ["y.glb", "take_0.bvh", "y.mp4"])
