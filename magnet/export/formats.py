@@ -350,14 +350,16 @@ def files_of(path: Path, slots: Sequence[Sequence[int]], smplx: bool = False, ea
 
 
 def left_over(written: Sequence[Path]) -> list[Path]:
-    """Files of further people beside those just written, out_2.bvh beside out_0.bvh and out_1.bvh: of another scene."""
+    """Files of other people beside those just written, out_2.bvh beside out_0.bvh and out_1.bvh: of another scene."""
     found: list[Path] = []
     for last in (path for path in written if path.stem.rpartition("_")[2].isdecimal()):
         base, _, number = last.stem.rpartition("_")
-        if last.with_name(f"{base}_0{last.suffix}") not in written or len(written) < 2:
+        if sum(path.stem.rpartition("_")[0] == base for path in written) < 2:
             continue  # a number that is part of the name
-        beside = (last.with_name(f"{base}_{k}{last.suffix}") for k in itertools.count(int(number) + 1))
-        found += [each for each in itertools.takewhile(Path.exists, beside) if {each}.isdisjoint({*written, *found})]
+        numbered = (last.with_name(f"{base}_{k}{last.suffix}") for k in itertools.count())
+        below = [each for each in itertools.islice(numbered, int(number)) if each.exists()]
+        there = [*below, *itertools.takewhile(Path.exists, numbered)]
+        found += [each for each in there if {each}.isdisjoint({*written, *found})]
     return found
 
 

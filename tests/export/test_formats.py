@@ -367,6 +367,15 @@ def test_files_of_more_people_from_before_are_named_and_stay(options: dict, duet
     assert not formats.left_over([tmp_path / f"st_1{kind}"])  # a person alone, who is called so
 
 
+def test_files_of_people_before_and_between_those_written_are_named(tmp_path: Path) -> None:
+    """Whoever is exported alone keeps a number, so that others' files may lie below it."""
+    files = [tmp_path / f"st_{person}.bvh" for person in (0, 1, 2, 3, 4, 6)]
+    for file in files:
+        file.touch()
+    assert formats.left_over([files[1], files[3]]) == [files[0], files[2], files[4]]
+    assert not formats.left_over([files[3], tmp_path / "other_1.bvh"])  # no people of one scene
+
+
 def test_commands_name_files_of_more_people_from_before(
     duet: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
