@@ -30,8 +30,10 @@ def in_front(recorded: Scene, read: Scene) -> tuple[Scene, int]:
         return recorded, 0
     bad = (~sound(recorded.slice(0, lead)).all(dim=0)).nonzero()[:, 0]
     left_out = int(bad[-1]) + 1 if len(bad) else 0
-    lost = f", the first {left_out}, which are not valid, are left out" if left_out else ""
-    kept = f", the {lead - left_out} before them stay in front" if left_out < lead else ""
+    first = "the first, which is not valid, is" if left_out == 1 else f"the first {left_out}, which are not valid, are"
+    lost = f", {first} left out" if left_out else ""
+    front = "one before them stays" if lead - left_out == 1 else f"{lead - left_out} before them stay"
+    kept = f", the {front} in front" if left_out < lead else ""
     print(f"of {recorded.frames} frames the last {read.frames} are read, for a token is 4{kept}{lost}")
     return recorded.slice(left_out), lead - left_out
 

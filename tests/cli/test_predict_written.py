@@ -46,8 +46,10 @@ def test_frames_in_front_that_are_not_sound_are_left_out(recorded: Scene, capsys
     files, lead = in_front(broken(recorded, 1), recorded.slice(3))
     assert (files.frames, lead) == (25, 1)
     said = capsys.readouterr().out
-    assert "the last 24 are read" in said and "the 1 before them stay in front" in said
+    assert "the last 24 are read" in said and "the one before them stays in front" in said
     assert "the first 2, which are not valid, are left out" in said
+    assert in_front(broken(recorded, 0), recorded.slice(3))[1] == 2
+    assert "the 2 before them stay in front, the first, which is not valid, is left out" in capsys.readouterr().out
     assert in_front(recorded, recorded) == (recorded, 0) and not capsys.readouterr().out
 
 
