@@ -109,7 +109,8 @@ class LiveFrames:
         """Take a pose that was tracked at some time, and give the tokens that are whole by that: (1, 4 n) or None.
 
         Args:
-            pose: (1, 1) everybody; slots of those who answer may hold anything that is finite.
+            pose: (1, 1) everybody; slots of those who answer may hold any finite pose that stays the same, for after
+                `hold` people are led for as long as whoever is furthest away needs.
             seconds: of any clock that does not go back.
 
         Raises:

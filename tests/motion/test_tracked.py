@@ -59,7 +59,7 @@ def test_frames_are_those_of_a_whole_recording_resampled(generator) -> None:
     assert torch.allclose(ours.body_rot, theirs.body_rot[:, :60], atol=1e-5)
 
 
-def test_frames_at_their_own_times_are_handed_on_bit_for_bit(generator) -> None:
+def test_frames_at_their_own_times_are_handed_on_as_they_are(generator) -> None:
     recording = random_scene(1, 12, 2, generator)
     live = LiveFrames()
     for n in range(12):
@@ -108,6 +108,16 @@ def test_who_is_held_stands_still_and_is_led_back_while_they_walk_on() -> None:
     assert (path[:31] == 0).all()
     assert path.diff().min() >= 0 and path.diff().max() < PACE / 30 + 1.7 * 0.02 + 1e-6
     assert path[-1] == pytest.approx(1.5 + 0.02 * (len(path) - 1 - 33), abs=1e-6)
+
+
+def test_slots_of_those_who_answer_delay_nobody_who_comes_back_where_they_hold_one_pose() -> None:
+    """Far away as they may be."""
+    live, got = LiveFrames(), []
+    for seconds, x in ((0.0, 0.0), (1.0, None), *((1.0 + n / 30, 0.5) for n in range(1, 50))):
+        pose = standing(0.0 if x is None else x)
+        pose.T_world_root[:, :, 0, :3, 3] = 1000.0
+        got.append(live.hold(seconds) if x is None else live.add(pose, seconds))
+    assert xs(cat_time([part for part in got if part is not None]))[-1] == 0.5
 
 
 def test_who_is_lost_again_on_the_way_back_stays_where_they_are() -> None:
