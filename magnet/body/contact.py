@@ -117,7 +117,7 @@ def depth_between(scene: Scene, body: Body, fixed: Tensor | None = None) -> Tens
     """
     joints, (b, t, one, other) = _near(scene, body)
     if fixed is not None:
-        still = fixed.expand(joints.shape[:3])
+        still = fixed.to(joints.device).expand(joints.shape[:3])
         free = ~(still[b, t, one] & still[b, t, other])
         b, t, one, other = (each[free] for each in (b, t, one, other))
     depth = joints.new_zeros(scene.scenes * scene.frames)

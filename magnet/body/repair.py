@@ -126,7 +126,7 @@ def pressed(
     deep = stays.any(dim=1).nonzero()[:, 0]
     if not len(deep):
         return offset
-    few, still = scene.select(deep), fixed
+    few, still = scene.select(deep), None if fixed is None else fixed.to(deep.device)
     if still is not None and still.ndim == 3 and len(still) == scene.scenes:
         still = still[deep]
     again = settling(few, body, how, still, STUBBORN, begun, slides=slides)
