@@ -109,6 +109,7 @@ def main(arguments: Sequence[str]) -> int:
     if options.people is None:
         scene_files.require_inputs(options.inputs, options.out or ())
     require_files(options.inputs)  # before anything else is asked for
+    scene_files.require_files_to_cut(options.inputs, options.start, options.end)
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     scene_files.require_not_there(options.inputs, options.out)

@@ -35,6 +35,17 @@ def add_body(options: Options) -> None:
     options.add_argument("--end", **END)
 
 
+def require_files_to_cut(inputs: Sequence[str], start: int, end: int | None) -> None:
+    """Refuse --start and --end where no files are read.
+
+    Raises:
+        CommandError: names the option.
+    """
+    if not inputs and (start or end is not None):
+        said = f"--start {start}" if start else f"--end {end}"
+        raise CommandError(f"{said}: chooses frames of files, and none are read; name a file, or leave it out")
+
+
 def add_origin(options: Options) -> None:
     """--in_fps, --in_unit, --up, --keep_floor and --joint, for files of other programs."""
     options.add_argument("--in_fps", **IN_FPS)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magnet.cli.flags import PlainParser
-from magnet.cli.scene_files import END, IN_FPS, START
+from magnet.cli.scene_files import END, IN_FPS, START, require_files_to_cut
 from magnet.sampling.presets import PRESETS, preset_name
 
 STEPS = 10
@@ -118,6 +118,7 @@ def announce(port: int, host: str, quiet: bool) -> None:
 def _check(options: argparse.Namespace) -> None:
     if not options.files and not options.live:
         raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
+    require_files_to_cut(options.files, options.start, options.end)
     if options.live and len(options.files) > 1:
         raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
     if options.record is not None and (options.live or len(options.files) != 1):

@@ -349,6 +349,16 @@ def test_another_frame_rate_is_refused_by_file_and_key(rate: np.ndarray, folder:
         load_smplx("amass.npz", body)
 
 
+@pytest.mark.parametrize("words", [["predict", "--people", "2", "--out", "o.npz"], ["view", "--live"]], ids=" ".join)
+@pytest.mark.parametrize("cut", [["--start", "5"], ["--end", "20"], ["--start", "0", "--end", "20"]], ids=" ".join)
+def test_frames_of_no_files_are_not_chosen(
+    words: list[str], cut: list[str], folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
+    said = refused(capsys, *words, *cut)
+    assert f"{' '.join(cut[-2:])}: chooses frames of files, and none are read" in said
+
+
 @pytest.mark.parametrize("before", [["--people", "3"], ["take_1.bvh"]], ids=" ".join)
 def test_files_behind_a_new_out_are_not_written_over(
     before: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
