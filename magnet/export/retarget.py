@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import torch
@@ -21,7 +20,6 @@ from magnet.body.joints import (  # isort: skip
     PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
 )  # fmt: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
-from magnet.export.bones import Names, bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.bvh_read import read_bvh
 from magnet.export.cutting import require_one_clock
@@ -195,12 +193,11 @@ def _jumps(skeleton: Skeleton) -> tuple[int, ...]:
 
 
 def _exact(skeleton: Skeleton, body: Body) -> tuple[Scene, Source] | None:
-    """The scene of a skeleton with names that we write, our tree and a shape of the body; None for any other."""
+    """The scene of a skeleton with our names, tree and a shape that the body can take; None for any other."""
     file = skeleton.file
-    written = next((names for names in map(bone_names, get_args(Names)) if set(names) <= set(file.names)), None)
-    if written is None:
+    if not set(JOINT_NAMES) <= set(file.names):
         return None
-    number = [file.names.index(name) for name in written]
+    number = [file.names.index(name) for name in JOINT_NAMES]
     if any(file.parents[number[j]] != number[PARENTS[j]] for j in range(1, BODY_JOINTS)):
         return None
     Q = np.round(skeleton.R_rest_ours)  # ours rest along the axes, however far a shape leans

@@ -182,13 +182,13 @@ def test_a_broken_file_is_named_with_what_is_wrong(message, trio: Scene, body: B
 
 
 @pytest.mark.parametrize("names", ["vrm", "mixamo"])
-def test_a_skeleton_of_other_names_comes_back_exactly(names: Names, trio: Scene, body: Body, tmp_path: Path):
-    """Written for programs that retarget by these."""
+def test_a_skeleton_of_other_names_comes_back_as_any_rig_does(names: Names, trio: Scene, body: Body, tmp_path: Path):
+    """Written for programs that retarget by these; a rig of theirs may look just so, so it is fitted."""
     paths = save_bvh(trio, tmp_path / "trio.bvh", body, names=names)
     assert sorted(read_bvh(paths[0]).names) == sorted(bone_names(names))
-    found = load_bvh(paths, body)
-    assert all(source.exact for source in found.sources)
-    assert (body.joints(found.scene) - body.joints(trio)).abs().max() < 1e-5
+    found = load_bvh(paths, body, keep_floor=True)
+    assert not any(source.exact for source in found.sources)
+    assert (body.joints(found.scene) - body.joints(trio)).norm(dim=-1).mean() < 0.02
 
 
 def test_frames_that_hold_nan_can_be_left_out_at_the_ends(trio: Scene, body: Body, tmp_path: Path):
