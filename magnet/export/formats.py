@@ -235,9 +235,8 @@ def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
 
 WRITTEN: dict[str, Format] = {
     ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
-    ".bvh": Format(
-        lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit, names=o.bones.names)
-    ),  # a skeleton a person, one file each
+    # A skeleton a person, one file each.
+    ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit, names=o.bones.names)),
     ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
     ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)], ready=blender),  # the same, by Blender
     **{suffix: Format(_write_usd, ready=require_usd) for suffix in USD},
