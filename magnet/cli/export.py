@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     clips = "one animation of a .glb for all, or one for each person"
     add("--clips", choices=("scene", "person"), default="scene", help=clips)
     pictures = options.add_argument_group("pictures, films and pages")
-    context = "first frames that a model was given, in files that do not say"
+    context = "first frames, from --start on, that a model was given, in files that do not say"
     pictures.add_argument("--context", type=int, default=0, metavar="FRAMES", help=context)
     scene_files.add_look(pictures)
     pictures.add_argument("--title", help="written above")

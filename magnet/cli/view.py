@@ -40,7 +40,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("files", nargs="*", metavar="FILE", help=files)
     add = parser.add_argument_group("what is shown").add_argument
     add("--truth", metavar="FILE", help="a scene to show as ghosts in each of the others (default: none)")
-    context = "first frames that a model was given, in files that do not say"
+    context = "first frames, from --start on, that a model was given, in files that do not say"
     add("--context", type=int, default=0, metavar="N", help=context)
     add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
