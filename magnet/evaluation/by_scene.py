@@ -14,6 +14,7 @@ import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 from torchmetrics import MetricCollection
+from torchmetrics.utilities import dim_zero_cat
 
 from magnet.metrics import Better, ClipMeans
 
@@ -98,16 +99,15 @@ def _read(written: Mapping[str, Any], scenes: int) -> Floats:
 # -- what a run measures -------------------------------------------------------------------
 
 
-def newest(metrics: Mapping[str, Any], scenes: int) -> list[Measured]:
-    """What the last `update` measured in each of its scenes, by method; nothing of one without a `MetricCollection`."""
+def in_each_scene(metrics: Mapping[str, MetricCollection], scenes: int) -> list[Measured]:
+    """What was measured in each of so many scenes of this process, by method, in the order they were measured."""
     found: list[Measured] = [{method: {} for method in metrics} for _ in range(scenes)]
     for method, collection in metrics.items():
-        for metric in collection.values() if isinstance(collection, MetricCollection) else ():
-            if isinstance(metric, ClipMeans) and metric.clips:  # none of a stranger's that failed
-                for scene, sums in zip(found, metric.clips[-1].tolist(), strict=True):
-                    scene[method] |= {
-                        name: (total, count) for name, (total, count) in zip(metric.names, sums, strict=True)
-                    }
+        for metric in collection.values():
+            if not isinstance(metric, ClipMeans) or not metric.clips:  # none of a stranger's that failed
+                continue
+            for scene, sums in zip(found, dim_zero_cat(metric.clips).tolist(), strict=True):
+                scene[method] |= dict(zip(metric.names, map(tuple, sums), strict=True))
     return found
 
 

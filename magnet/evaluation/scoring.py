@@ -17,7 +17,7 @@ from magnet.baselines.predictor import JointBaseline, Predictor, SceneBaseline
 from magnet.baselines.windows import moved_points
 from magnet.body import Body
 from magnet.datamodules.base import MotionDataModule
-from magnet.evaluation.by_scene import Measured, newest, of_all_processes, scene_values
+from magnet.evaluation.by_scene import in_each_scene, of_all_processes, scene_values
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import occupied
 from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
@@ -157,7 +157,7 @@ class Scoring:
             if self.past_is_given:
                 self.methods |= self._baselines(datamodule, self.windows)
         self.metrics = self._metrics(datamodule.store("test").fps)
-        self.found: dict[int, tuple[str, int, Measured]] = {}  # by the number of a scene
+        self.measured: list[tuple[int, str, int]] = []  # number, name and unit of each scene, in order
         self.seconds: dict[str, float] = dict.fromkeys(self.methods, 0.0)
 
     def _metrics(self, fps: float) -> dict[str, MetricCollection]:
@@ -252,9 +252,7 @@ class Scoring:
             joints, found = self._instead(self.windows, batch, numbers)
             self.metrics[TRAINING].update(joints, future, batch.present & found[:, None], **here)
         names = batch.names or ("",) * batch.scenes
-        self.found |= dict(
-            zip(numbers, zip(names, units.tolist(), newest(self.metrics, batch.scenes), strict=True), strict=True)
-        )
+        self.measured += zip(numbers, names, units.tolist(), strict=True)
 
     def _instead(self, windows: Windows, batch: Scene, numbers: list[int]) -> tuple[Tensor, Tensor]:
         """Futures of training windows in place of samples, dealt out evenly over all test scenes.
@@ -276,6 +274,8 @@ class Scoring:
 
     def finish(self, facts: dict[str, Any]) -> Results:
         """The table of all methods, with how it came about."""
+        sums = in_each_scene(self.metrics, len(self.measured))
+        found = {number: (name, unit, each) for (number, name, unit), each in zip(self.measured, sums, strict=True)}
         rows = {name: _plain(metrics) for name, metrics in self.metrics.items()}
         lost = lost_numbers(self.metrics.values())
         rows = {name: {key: row[key] for key in row if not stems(key) & lost} for name, row in rows.items()}
@@ -288,7 +288,7 @@ class Scoring:
             rows[name] = {key: value for key, value in row.items() if beside(key, columns) not in without}
         rows = {name: row for name, row in rows.items() if row}
         seconds = {name: round(value, 2) for name, value in self.seconds.items()}
-        scenes = scene_values(of_all_processes(self.found), rows)
+        scenes = scene_values(of_all_processes(found), rows)
         return Results(rows, facts | {"seconds": seconds}, columns, scenes)
 
 
