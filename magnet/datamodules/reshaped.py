@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -37,7 +38,8 @@ class Reshaped(Parts):
     People keep their steps and the hands that they hold (`magnet.body.other_shapes.with_shapes`); so the same poses
     come with other distances, and place cannot be learnt by heart from poses. First people of a scene exchange their
     shapes, leader and follower; further scenes draw shapes from everybody in the training clips. Scenes are made once,
-    some 190 frames a second, and kept in a cache. Sources of clips, for `weights`: "cmu-couples-reshaped" and so on.
+    some 190 frames a second, and kept in a cache; processes that begin at once share the work. Sources of clips, for
+    `weights`: "cmu-couples-reshaped" and so on.
 
     Args:
         data: the data sets; their scenes of two and more people are used.
@@ -121,6 +123,7 @@ class Reshaped(Parts):
         todo = [each for each in wanted if not each[3].exists()]
         if not todo:
             return
+        random.Random(os.getpid()).shuffle(todo)  # trainings that begin at once share the work
         with writing(self.folder, ADVICE):
             self.folder.mkdir(parents=True, exist_ok=True)
         rank_zero_info(f"Reshaped: giving other shapes to {len(todo)} scenes once, into {self.folder}")
@@ -128,7 +131,9 @@ class Reshaped(Parts):
         with one_thread(), progress_bar() as tell, TemporaryDirectory() as aside:
             for clip, number, betas, file in todo:
                 tell(f"{clip.name} {number}", done, frames)
+                done += clip.scene.frames
+                if file.exists():
+                    continue
                 made = with_shapes(clip.scene, betas, self.body)
                 content = made.save(Path(aside) / "scene.npz").read_bytes()
                 write_whole(self.folder, file.name, content, advice=ADVICE)
-                done += clip.scene.frames

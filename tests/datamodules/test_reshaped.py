@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from magnet.body.base import Body
 from magnet.body.holding import between_hands, holds
 from magnet.body.other_shapes import with_shapes
 from magnet.datamodules import reshaped
@@ -14,6 +15,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.reshaped import Reshaped
 from magnet.datamodules.synthetic import Synthetic
+from magnet.motion.scene import Scene
 
 
 class Shaped(MotionDataModule):
@@ -61,6 +63,24 @@ def test_scenes_are_made_once_and_again_if_their_recording_changes(
     Reshaped([Shaped()], variants=3, shape_seed=1, cache=data.cache).prepare_data()
     assert set(files) < set(data.folder.iterdir()), "other draws, but exchanged shapes are there"
     assert len(list(data.folder.iterdir())) <= 5
+
+
+def test_what_another_process_has_made_meanwhile_is_not_made_again(
+    data: Reshaped, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[torch.Tensor] = []
+    others = Reshaped([Shaped()], variants=3, cache=data.cache)
+
+    def make(scene: Scene, betas: torch.Tensor, body: Body) -> Scene:
+        made.append(betas)
+        if len(made) == 1:
+            others.prepare_data()  # makes all three; the two that are left here are there by then
+        return scene.replace(betas=betas)
+
+    monkeypatch.setattr(reshaped, "with_shapes", make)
+    data.prepare_data()
+    assert len(list(data.folder.iterdir())) == 3
+    assert len(made) == 4  # one here, three there
 
 
 def test_a_damaged_file_of_the_cache_is_made_again(data: Reshaped) -> None:
