@@ -23,12 +23,14 @@ from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
 from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate
+from magnet.generation.unmade import completed
 from magnet.motion.scene import FPS, Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
+from magnet.sampling.grid import Grid
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, schedule_of
 
 __all__ = ["Model", "Motion", "NotebookView", "load", "read"]
 
@@ -261,6 +263,8 @@ class Model:
     ) -> Motion:
         """Sample any task with its options `fields`; `magnet tasks` lists both.
 
+        Whoever the task does not make is as recorded where the scene goes on, and else stands still.
+
         Args:
             context: frames given of everybody at the start, a multiple of 4.
             frames: frames after the context; None: to the end of the scene.
@@ -289,7 +293,8 @@ class Model:
         sample = generate if slots <= self.most_people else generate_crowd
         sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
-        return Motion.of(shown, body)
+        grid = Grid(-(-(context + frames) // TOKEN_FRAMES), slots, context // TOKEN_FRAMES, self.sampler.steps)
+        return Motion.of(completed(shown, plain.to("cpu"), ~schedule_of(chosen, grid).finished), body)
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)

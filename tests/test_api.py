@@ -154,12 +154,19 @@ def test_every_task_can_be_asked_for_by_name(task, model: Model, duet: Scene):
     assert (motion.frames, motion.agents) == (context + 16, 2)
     schedule = registry.get(task)().schedule(Grid((context + 16) // 4, 3, context // 4, 2, 8, 4))
     assert motion.given is not None
-    assert torch.equal(motion.given[0, ::4], schedule.known[:, :2])
+    assert torch.equal(motion.given[0, ::4], (schedule.known | ~schedule.finished)[:, :2])
+
+
+def test_whoever_a_task_does_not_make_is_as_recorded_and_then_stands_still(model: Model, duet: Scene):
+    made = model.predict(duet, "partner_prediction", context=32, frames=24, seed=0, target=(1,))
+    assert torch.equal(made.T_world_root[:, 32:50, 0], duet.T_world_root[:, 32:50, 0])
+    assert torch.equal(made.T_world_root[:, 50:, 0], duet.T_world_root[:, 49:, 0].expand(-1, 6, -1, -1))
+    assert made.given[:, :, 0].all() and not made.given[:, 32:, 1].any()
 
 
 def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
     motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
-    assert motion.given is not None and not motion.given[:, 16:].any()
+    assert motion.given is not None and not motion.given[:, 16:, 1].any()
 
 
 def test_scenes_keep_what_they_know_when_cut_and_ordered(model: Model, duet: Scene):

@@ -154,12 +154,12 @@ def main(arguments: Sequence[str]) -> int:
         samples=options.samples,
         **task.fields,
     )
-    took = time.perf_counter() - began
-    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead)
-    print(f"{task.name}: {count} frames{seen} in {took:.1f} s, seed {options.seed}")
+    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead, unmade)
+    print(f"{task.name}: {count} frames{seen} in {time.perf_counter() - began:.1f} s, seed {options.seed}")
     from magnet.export import formats
+    from magnet.generation.unmade import completed
 
-    given, plain = lead + made.context, predict_written.completed(made.plain(), files, lead, unmade)
+    given, plain = lead + made.context, completed(made.plain(), files, unmade, lead)
     if plain.scenes > 1 and scene.scenes == 1:
         plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
     look: dict[str, Any] = {"style": options.style, "size": size, "context_frames": given}

@@ -14,18 +14,13 @@ NAMED = 4
 """People who are named one by one; of more, a line says how many."""
 
 
-def sound(recorded: Scene) -> Tensor:
-    """Frames in which everybody's motion is finite and counts. -> (B, T) bool"""
-    finite = recorded.body_rot.flatten(3).isfinite().all(-1) & recorded.T_world_root.flatten(3).isfinite().all(-1)
-    there = (finite | ~recorded.present[:, None]).all(dim=-1)
-    return there if recorded.valid is None else there & recorded.valid
-
-
 def in_front(recorded: Scene, read: Scene) -> tuple[Scene, int]:
     """The files' scene without first frames that can stand nowhere, and how many frames are in front of what is read.
 
     What is read are whole tokens from the end of the files, so that up to three frames stand before it. They are said.
     """
+    from magnet.generation.unmade import sound
+
     if not (lead := recorded.frames - read.frames):
         return recorded, 0
     bad = (~sound(recorded.slice(0, lead)).all(dim=0)).nonzero()[:, 0]
@@ -38,53 +33,12 @@ def in_front(recorded: Scene, read: Scene) -> tuple[Scene, int]:
     return recorded.slice(left_out), lead - left_out
 
 
-def completed(made: Scene, recorded: Scene, lead: int, unmade: Tensor) -> Scene:
-    """What a model made, with the recording of whoever it did not make, and the recorded frames in front.
-
-    The recording is put in now, after sampling, which must not know of it. Whoever has no recording (any more) stands
-    still in the last recorded pose. All that was not made is marked as given, so that pictures show it so.
-
-    Args:
-        made: S samples of each of B scenes, T frames.
-        recorded: the B scenes of the files.
-        lead: frames of the files before the first frame of `made`.
-        unmade: (N, P) bool, token steps of people that the task neither reads nor makes.
-
-    Returns:
-        B * S scenes of lead + T frames.
-    """
-    import torch
-
-    from magnet.motion.scene import cat_time
-
-    recorded = recorded.to_float32().repeat(made.scenes // recorded.scenes)
-    where = by_frame(unmade, made) & made.present[:, None]
-    if bool(where.any()):
-        last = torch.where(sound(recorded), torch.arange(recorded.frames), -1).cummax(dim=1).values  # (B S, T')
-        frame = last[:, (lead + torch.arange(made.frames)).clamp(max=recorded.frames - 1)]  # (B S, T)
-        scene = torch.arange(made.scenes)[:, None]
-        held = frame.clamp_min(0)
-        poses = recorded.body_rot[scene, held], recorded.T_world_root[scene, held]
-        given = None if made.given is None else made.given | where
-        made = made.with_poses(where & (frame >= 0)[..., None], *poses).replace(given=given)
-    if not lead:
-        return made
-    front = recorded.slice(0, lead)
-    return cat_time([front.replace(given=front.present[:, None].expand(-1, lead, -1)), made])
-
-
-def by_frame(unmade: Tensor, made: Scene) -> Tensor:
-    """Token steps as frames of a scene. (N, P) bool -> (1, T, P)"""
-    from magnet.motion.tokens import TOKEN_FRAMES
-
-    return unmade.repeat_interleave(TOKEN_FRAMES, dim=0)[None, : made.frames]
-
-
 def said_of_unmade(task: str, recorded: Scene, lead: int, frames: int, unmade: Tensor) -> list[str]:
     """Lines on people whom a task does not make: from when to when they are as recorded, and when they stand still.
 
-    frames: of what is written behind the first `lead`; else as for `completed`.
+    frames: of what is written behind the first `lead`; else as for `magnet.generation.unmade.completed`.
     """
+    from magnet.generation.unmade import sound
     from magnet.motion.tokens import TOKEN_FRAMES
 
     good = sound(recorded).all(dim=0).nonzero()[:, 0]
@@ -115,11 +69,16 @@ def named(people: Sequence[int]) -> str:
     return f"person {names[0]}" if len(names) == 1 else f"people {', '.join(names[:-1])} and {names[-1]}"
 
 
-def said_of_given(made: Scene, lead: int = 0) -> str:
+def said_of_given(made: Scene, lead: int = 0, unmade: Tensor | None = None) -> str:
     """How many frames of whom were given, in all scenes, as a part of a sentence; empty where none were.
 
     lead: recorded frames in front of those that were made.
+    unmade: as for `magnet.generation.unmade.completed`; such frames are marked as given, and no model read them.
     """
+    if unmade is not None and made.given is not None:
+        from magnet.generation.unmade import by_frame
+
+        made = made.replace(given=made.given & ~by_frame(unmade, made))
     if made.given is None or not bool(made.given.any()):
         return ""
     there = made.present.any(dim=0).nonzero()[:, 0].tolist()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from magnet.cli.predict_written import completed, in_front, named, said_of_given, said_of_unmade
+from magnet.cli.predict_written import in_front, named, said_of_given, said_of_unmade
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -26,20 +26,6 @@ def broken(scene: Scene, frame: int) -> Scene:
     roots = scene.T_world_root.clone()
     roots[:, frame] = torch.nan
     return scene.replace(T_world_root=roots)
-
-
-def test_whoever_is_left_out_holds_the_last_frame_that_is_sound(recorded: Scene) -> None:
-    files = broken(recorded, 20)
-    made = random_scene(2, 24, 3, torch.Generator().manual_seed(1))
-    made = made.replace(given=torch.zeros(2, 24, 3, dtype=torch.bool), present=files.present.expand(2, 3))
-    scene = completed(made, files, 3, left_out(2, 2))
-    assert scene.frames == 27 and scene.given[:, :3].all()
-    assert torch.equal(scene.T_world_root[:, :3], files.T_world_root[:, :3].expand(2, -1, -1, -1, -1))
-    assert torch.equal(scene.T_world_root[1, 11:20, 2], files.T_world_root[0, 11:20, 2])
-    assert torch.equal(scene.T_world_root[1, 20, 2], files.T_world_root[0, 19, 2]), "not what is no number"
-    assert torch.equal(scene.T_world_root[1, 21:, 2], files.T_world_root[0, 21:, 2])
-    assert torch.equal(scene.T_world_root[:, 3:, :2], made.T_world_root[:, :, :2]), "who was made stays"
-    assert scene.given[:, 3:].sum(dim=1).tolist() == [[0, 0, 16]] * 2
 
 
 def test_frames_in_front_that_are_not_sound_are_left_out(recorded: Scene, capsys: pytest.CaptureFixture[str]) -> None:

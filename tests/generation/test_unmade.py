@@ -1,0 +1,25 @@
+"""People whom a task does not make are as recorded."""
+
+from __future__ import annotations
+
+import torch
+
+from magnet.generation.unmade import completed
+from magnet.testing import random_scene
+
+
+def test_whoever_is_left_out_holds_the_last_frame_that_is_sound() -> None:
+    files = random_scene(1, 27, 3, torch.Generator().manual_seed(0)).to_float32()
+    files.T_world_root[:, 20] = torch.nan
+    made = random_scene(2, 24, 3, torch.Generator().manual_seed(1))
+    made = made.replace(given=torch.zeros(2, 24, 3, dtype=torch.bool), present=files.present.expand(2, 3))
+    left_out = torch.zeros(6, 3, dtype=torch.bool)
+    left_out[2:, 2] = True
+    scene = completed(made, files, left_out, lead=3)
+    assert scene.frames == 27 and scene.given[:, :3].all()
+    assert torch.equal(scene.T_world_root[:, :3], files.T_world_root[:, :3].expand(2, -1, -1, -1, -1))
+    assert torch.equal(scene.T_world_root[1, 11:20, 2], files.T_world_root[0, 11:20, 2])
+    assert torch.equal(scene.T_world_root[1, 20, 2], files.T_world_root[0, 19, 2]), "not what is no number"
+    assert torch.equal(scene.T_world_root[1, 21:, 2], files.T_world_root[0, 21:, 2])
+    assert torch.equal(scene.T_world_root[:, 3:, :2], made.T_world_root[:, :, :2]), "who was made stays"
+    assert scene.given[:, 3:].sum(dim=1).tolist() == [[0, 0, 16]] * 2
