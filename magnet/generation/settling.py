@@ -59,9 +59,12 @@ Whole people are hardly moved, because who is moved four frames at a time change
 (docs/experiments_corrections.md).
 """
 
-PRESSED = replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=0.3, stand=16.0, hold=2.0)
-"""How they are corrected where that leaves somebody deep in another (`LEFT`): moved out of the way as a whole,
-smoothly, for a hand that jumps is seen more than some centimetres of depth."""
+PRESSED = tuple(
+    replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=root, stand=16.0, hold=2.0) for root in (3.0, 0.3)
+)
+"""How they are corrected, one after the other, while somebody is left deep in another (`LEFT`): moved out of the way as
+a whole, smoothly, for a hand that jumps is seen more than some centimetres of depth. The second moves people readily,
+which shows at token borders, and keeps out who walks through somebody."""
 
 REMEMBERED = 60
 """Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in
@@ -233,12 +236,14 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
-    deep = left_deep(corrected(seen, offset), body, LEFT, fixed).any(dim=1)
-    if bool(deep.any()):
+    for harder in PRESSED:
+        deep = left_deep(corrected(seen, offset), body, LEFT, fixed).any(dim=1)
+        if not bool(deep.any()):
+            break
         before, hold = (None if each is None else each[deep] for each in (past, holding))
         ends = None if last is None else (last[0][deep], last[1][deep])
         few = seen.select(deep.nonzero()[:, 0])
-        offset[deep] = settling(few, body, how, fixed, PRESSED, begun, before, holding=hold, last=ends)
+        offset[deep] = settling(few, body, how, fixed, harder, begun, before, holding=hold, last=ends)
     return offset
 
 
