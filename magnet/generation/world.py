@@ -386,12 +386,12 @@ class WorldState:
 
     def _shown_path(self, first: int, stop: int) -> Tensor:
         """Canonical frames of rows [first, stop) as they are shown. -> (B, 4 n, P, 4, 4)"""
-        until = stop * TOKEN_FRAMES + 1
+        until = stop * TOKEN_FRAMES + 2
         T_world_can, frames = self.T_world_can[:, :until], slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         if self.options.smooth_path:
-            T_world_can = smoothed_path(
-                T_world_can, *(self.by_frame(each)[:until] for each in (self.placed, self.known))
-            )
+            beside = self.known.any(dim=1, keepdim=True) & ~self.known
+            who = (self.by_frame(each)[:until] for each in (self.placed, self.known, beside))
+            T_world_can = smoothed_path(T_world_can, *who)
         return T_world_can[:, frames]
 
     def by_frame(self, rows: Tensor) -> Tensor:
