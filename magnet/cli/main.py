@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-from magnet.cli import predict_files
+from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
 from magnet.cli.pipes import CLOSED, output_closed
 from magnet.errors import Stopped
@@ -141,8 +141,10 @@ def run(command: str, arguments: list[str]) -> int:
     Raises:
         CommandError: no such command.
     """
-    if command == "predict" and predict_files.meant(arguments):
-        return predict_files.main(arguments)
+    if command == "predict":
+        if predict_files.meant(arguments):
+            return predict_files.main(arguments)
+        scene_files.require_no_files_meant(arguments)
     if command in TRAINER_COMMANDS:
         if (code := quick_answer(command, arguments)) is not None:
             return code

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
 Options = argparse.ArgumentParser | argparse._ArgumentGroup
 
+OF_FILES = (
+    *("--frames", "--context", "--spacing", "--style", "--size", "--start", "--end", "--trim"),
+    *("--body", "--in_fps", "--in_unit", "--up", "--keep_floor", "--joint"),
+)
+"""Options of `magnet predict` that go with files, or with people from nothing, and not with a data set."""
+
 
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> argparse.ArgumentParser:
     """A parser that knows IN."""
@@ -33,6 +39,20 @@ def add_body(options: Options) -> None:
     options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
     options.add_argument("--start", **START)
     options.add_argument("--end", **END)
+
+
+def require_no_files_meant(arguments: Sequence[str]) -> None:
+    """Refuse options of files where no file and no people are named, so that a data set is to be sampled.
+
+    Raises:
+        CommandError: names the option, and the two ways to say what is meant.
+    """
+    names = (argument.partition("=")[0] for argument in arguments)
+    if name := next((name for name in names if name in OF_FILES), None):
+        raise CommandError(
+            f"{name} goes with files or with people from nothing, and neither is named: magnet predict IN.bvh {name} "
+            f"... --out OUT.glb, or --people 2 {name} ... --out OUT.glb; without them a data set is sampled"
+        )
 
 
 def require_files_to_cut(inputs: Sequence[str], start: int, end: int | None) -> None:

@@ -273,6 +273,22 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
     assert not meant(["generation"]) and not meant(["--help"]) and meant(["--help", "files"])
 
 
+@pytest.mark.parametrize("option", ["--frames", "--context=8", "--style"])
+def test_an_option_of_files_without_files_says_what_to_name(option: str, capsys) -> None:
+    assert cli.main(["predict", option, "20", "--samples", "2"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"magnet: error: {option.partition('=')[0]} goes with files") and "--people 2" in said
+
+
+def test_options_of_files_are_those_that_a_data_set_does_not_have() -> None:
+    from magnet.cli.predict_files import parser
+    from magnet.cli.scene_files import OF_FILES
+
+    known = {name for action in parser()._actions for name in action.option_strings}
+    shared = {"-h", "--help", "--out", "--task", "--task.FIELD", "--people", "--samples", "--seed", "--ckpt_path"}
+    assert set(OF_FILES) == known - shared - {"--sampler", "--sampler.FIELD"}
+
+
 def test_files_may_stand_behind_options() -> None:
     from magnet.cli.predict_files import READ, meant
 
