@@ -43,13 +43,14 @@ def misread(scene: Scene, counts: Tensor, low: Tensor, step: Tensor) -> tuple[in
 
     Args:
         scene: some moments of what is given.
-        counts: (B, F, P) bool, who is given in which.
+        counts: (B, F, P) bool, who is given in which; a scene of which nothing is given is none of these.
         low: (B, F, P) height over y = 0 of each person's lowest point, metres.
         step: (B, S, P) metres from one frame to the next, NaN where that is not known.
     """
     scene, low = scene.to_float32(), low.float()
+    something = counts.flatten(1).any(dim=1)  # (B,) is given
     upright = _mean(scene.T_world_root[..., 1, 1], counts)  # (B, P), NaN of nobody
-    for b in (~(upright >= UPRIGHT).any(dim=1)).nonzero()[:, 0].tolist():
+    for b in (something & ~(upright >= UPRIGHT).any(dim=1)).nonzero()[:, 0].tolist():
         if said := _turned(scene.select([b]), low[b], counts[b]):
             return b, said
     pelvis = scene.T_world_root[..., :3, 3]
@@ -57,7 +58,7 @@ def misread(scene: Scene, counts: Tensor, low: Tensor, step: Tensor) -> tuple[in
     times = torch.where(counts, times, torch.inf).flatten(1).amin(dim=1)  # about 1 of who was put onto the floor
     speeds = step.flatten(1).nanquantile(0.75, dim=1) * FPS if step.numel() else torch.zeros_like(times)
     apart = _apart(pelvis, counts)
-    far = (times > UNITS["m"] / UNITS["inch"] / ROUGHLY) | (speeds > FAST) | (apart > APART)
+    far = something & ((times > UNITS["m"] / UNITS["inch"] / ROUGHLY) | (speeds > FAST) | (apart > APART))
     if not bool(far.any()):
         return None
     b = int(far.nonzero()[0, 0])

@@ -160,3 +160,10 @@ def test_of_several_scenes_the_one_is_named_that_is_strange() -> None:
     both = concatenate([DUET, scaled(DUET, 100.0)])
     with pytest.raises(ValueError, match=r"^scene 1.*: pelvises are \d+ m over y = 0"):
         check_given(both, counted(both))
+
+
+def test_a_scene_of_which_nothing_is_given_is_not_looked_at(model: Model) -> None:
+    alone = DUET.slice(0, FRAMES).permute_agents(torch.tensor([0]))
+    both = concatenate([DUET.slice(0, FRAMES), alone])  # the second one has nobody in slot 1, who has the keyframes
+    made = model.predict(both, "inbetweening", context=0, frames=FRAMES, seed=0, every=4, agents=(1,))
+    assert made.present.tolist() == [[True, True], [True, False]]
