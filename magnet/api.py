@@ -22,15 +22,15 @@ from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
 from magnet.generation.partner import Partner
+from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.generation.unmade import completed
 from magnet.motion.scene import FPS, Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
-from magnet.sampling.grid import Grid
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
-from magnet.tasks.base import Task, schedule_of
+from magnet.tasks.base import Task
 
 __all__ = ["Model", "Motion", "NotebookView", "load", "read"]
 
@@ -293,8 +293,8 @@ class Model:
         sample = generate if slots <= self.most_people else generate_crowd
         sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
-        grid = Grid(-(-(context + frames) // TOKEN_FRAMES), slots, context // TOKEN_FRAMES, self.sampler.steps)
-        return Motion.of(completed(shown, plain.to("cpu"), ~schedule_of(chosen, grid).finished), body)
+        plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
+        return Motion.of(completed(shown, plain.to("cpu"), ~plan.finished), body)
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)

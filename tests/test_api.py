@@ -164,6 +164,12 @@ def test_whoever_a_task_does_not_make_is_as_recorded_and_then_stands_still(model
     assert made.given[:, :, 0].all() and not made.given[:, 32:, 1].any()
 
 
+def test_blocks_may_be_as_long_as_the_models_window(duet: Scene):
+    wide = Model(tiny_denoiser(max_agents=2, window=24), SamplerOptions(steps=2))
+    made = wide.predict(duet, "agentic_sync", context=8, frames=80, seed=0, block=20)
+    assert made.frames == 88
+
+
 def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
     motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
     assert motion.given is not None and not motion.given[:, 16:, 1].any()

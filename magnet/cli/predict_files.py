@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import time
 from collections.abc import Sequence
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from magnet.cli.tasks import TaskChoice
     from magnet.motion.scene import Scene
     from magnet.sampling.options import SamplerOptions
-    from magnet.sampling.schedule import MaskSchedule
 
 CONTEXT = 32
 """Frames given of everybody where nothing is said and the task reads what comes later, as in its tests: a second."""
@@ -113,15 +113,13 @@ def main(arguments: Sequence[str]) -> int:
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
     scene_files.require_not_there(options.inputs, options.out)
-    for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise CommandError(f"--{name} {value}: expected at least {least}")
+    require_counts(options)
     size, one = tuple(options.size), options.samples == 1
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     from magnet.api import Model, Motion
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.denoiser.core import DenoiserCore
+    from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
 
     sampler = sampler_of(options.sampler or "default", groups["sampler"])
@@ -137,12 +135,12 @@ def main(arguments: Sequence[str]) -> int:
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
     files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)
-    (files, lead), plan = predict_written.in_front(files, scene), plan_of(task, scene, context, frames, model)
-    unmade, past = ~plan.finished, context // TOKEN_FRAMES
-    for line in (
-        *predict_keys.said_of_keys(scene, plan.known, past),
-        *predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade),
-    ):
+    files, lead = predict_written.in_front(files, scene)
+    plan = plan_of_scene(model.denoiser, task.task, scene.agents, context, frames, sampler)
+    unmade = ~plan.finished
+    for line in predict_keys.said_of_keys(scene, plan.known, context // TOKEN_FRAMES):
+        print(line)
+    for line in predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade):
         print(line)
     began = time.perf_counter()
     made = model.predict(
@@ -166,6 +164,18 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
+
+
+def require_counts(options: argparse.Namespace) -> None:
+    """Refuse numbers of frames and samples that cannot be.
+
+    Raises:
+        CommandError: names the option.
+    """
+    for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise CommandError(f"--{name} {value}: expected at least {least}")
 
 
 def require_files(paths: Sequence[str]) -> None:
@@ -312,24 +322,23 @@ def lengths(
         CommandError: the task reads motion that was not recorded.
         ValueError: the task makes no sense at these sizes.
     """
+    from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
-    from magnet.sampling.grid import Grid
-    from magnet.tasks.base import schedule_of
 
     crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
     context = context_of(options, scene.frames, recorded, nothing)
     rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
-    tokens, steps = -(-(context + rest) // TOKEN_FRAMES), model.sampler.steps
+    planned = functools.partial(plan_of_scene, model.denoiser, choice.task, scene.agents, options=model.sampler)
     if added:  # planned with a past, for tasks that need one refuse to be planned without
-        planned = schedule_of(choice.task, Grid(tokens + 1, scene.agents, max(context // TOKEN_FRAMES, 1), steps)).known
-        if bool(planned[:, list(added)].any()):
+        longer = planned(max(context, TOKEN_FRAMES), rest + min(context, TOKEN_FRAMES))
+        if bool(longer.known[:, list(added)].any()):
             raise CommandError(
                 f"{choice.name} reads motion of person {added[0]}, of whom no file tells; partner_inpainting adds "
                 "people to those that are there, generation makes everybody"
             )
-    known = plan_of(choice, scene, context, rest, model).known
+    known = planned(context, rest).known
     if bool(known[context // TOKEN_FRAMES :].any()):
         return scene, context, rest if options.frames or recorded > context else FUTURE
     if bool(known.any()):
@@ -339,20 +348,6 @@ def lengths(
         if options.inputs:
             print(f"{choice.name} is given no motion: of the files only the number and shapes of people are read")
     return scene, context, options.frames or FUTURE
-
-
-def plan_of(choice: TaskChoice, scene: Scene, context: int, frames: int, model: Model) -> MaskSchedule:
-    """The task's plan for so many frames after the context: what it reads, and what it makes.
-
-    Raises:
-        ValueError: the task makes no sense at these sizes.
-    """
-    from magnet.motion.tokens import TOKEN_FRAMES
-    from magnet.sampling.grid import Grid
-    from magnet.tasks.base import schedule_of
-
-    tokens, past = -(-(context + frames) // TOKEN_FRAMES), context // TOKEN_FRAMES
-    return schedule_of(choice.task, Grid(tokens, scene.agents, past, model.sampler.steps))
 
 
 def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing: bool) -> int:

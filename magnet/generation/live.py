@@ -18,15 +18,15 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
 from magnet.generation.partner import Partner
+from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
-from magnet.sampling.schedule import Grid
 from magnet.tasks import registry
-from magnet.tasks.base import Task, schedule_of
+from magnet.tasks.base import Task
 from magnet.tasks.inbetweening import Inbetweening
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl
@@ -215,9 +215,8 @@ class Live:
             task = self.task()
             frames = self._length(type(task))
         past = scene.slice(scene.frames - CONTEXT)
-        grid = Grid((CONTEXT + frames) // TOKEN_FRAMES, scene.agents, CONTEXT // TOKEN_FRAMES, self.settings.steps)
-        known = schedule_of(task, grid).known
-        if not bool(known[: grid.context].all()):
+        known = plan_of_scene(self.model, task, scene.agents, CONTEXT, frames, self._options()).known
+        if not bool(known[: CONTEXT // TOKEN_FRAMES].all()):
             raise ValueError(
                 f"{self.settings.task} does not go on from everybody's past, so it cannot be played live; "
                 "try joint_future, motion_control or inbetweening"

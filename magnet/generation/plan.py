@@ -9,6 +9,10 @@ from typing import NamedTuple
 
 import torch
 
+from magnet.denoiser.core import DenoiserCore
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.grid import planning_grid
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks.base import Task, schedule_of
 
@@ -22,6 +26,24 @@ class PlannedStage(NamedTuple):
 
 
 Plan = Iterator[PlannedStage]
+
+
+def plan_of_scene(
+    model: DenoiserCore, task: Task, agents: int, context: int, frames: int, options: SamplerOptions
+) -> MaskSchedule:
+    """What a task knows and makes of a scene, and in which order, where this model samples it with these options.
+
+    Args:
+        agents: slots of the scene.
+        context: frames given of everybody at the start, whole tokens.
+        frames: frames after them.
+
+    Raises:
+        ValueError: the task makes no sense at these sizes.
+    """
+    tokens = -(-(context + frames) // TOKEN_FRAMES)
+    options = options.filled(model.sampling)
+    return schedule_of(task, planning_grid(tokens, agents, context // TOKEN_FRAMES, model.window, options))
 
 
 def planned(schedule: MaskSchedule) -> Plan:

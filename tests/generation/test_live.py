@@ -61,6 +61,13 @@ def test_every_task_plays_or_says_why_not(live: Live, name: str) -> None:
         assert bool(live.scene.T_world_root.isfinite().all())
 
 
+def test_blocks_may_be_as_long_as_the_models_window() -> None:
+    wide = Live(tiny_denoiser(max_agents=2, window=24), generator=torch.Generator().manual_seed(1))
+    wide.settings.steps, wide.settings.chunk = 2, 80
+    wide.settings.task, wide.settings.fields = "agentic_sync", {"block": 20}
+    assert wide.advance().frames == 80
+
+
 def test_same_seed_same_motion(model) -> None:
     def play() -> Scene:
         live = Live(model, 2, generator=torch.Generator().manual_seed(4))
