@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
         plot = Path(options.plot)
-        was, now = (by_frame(scene, got.body) for scene in (before, refined))
+        was, now = (curves(scene, got.body) for scene in (before, refined))
         plot.parent.mkdir(parents=True, exist_ok=True)
         plot.write_text(drawn(was, now, got.scene.fps), encoding="utf-8")
         scene_files.say_written([plot])
@@ -191,14 +191,14 @@ WIDTH, HEIGHT, LEFT, GAP = 900, 120, 70, 42
 """Pixels of the picture and of one strip of it, of the margin and between strips."""
 
 
-def by_frame(scene: Scene, body: Body) -> dict[str, Tensor]:
-    """What is marked on bodies, in each frame of the first scene: by title, (T,)."""
+def curves(scene: Scene, body: Body) -> dict[str, Tensor]:
+    """What is marked on bodies, in each frame of the first scene that somebody is in: by title, (T,)."""
     import torch
 
     from magnet.body.contact import deepest, hand_distance, toe_steps
     from magnet.body.joints import FEET
 
-    one = scene.select([0])
+    one = scene.select([int(scene.present.any(dim=1).int().argmax())])
     joints = body.joints(one)[0][:, one.present[0]]  # (T, P, 22, 3)
     depth, hands = joints.new_zeros(len(joints)), joints.new_zeros(len(joints))
     for i, j in combinations(range(joints.shape[1]), 2):

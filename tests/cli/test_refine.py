@@ -12,7 +12,7 @@ from magnet import cli
 from magnet.body import load_body
 from magnet.body.contact import depth_between, overlaps
 from magnet.cli.refine import told
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate, empty_scene
 from magnet.synthesis import synthesize
 
 
@@ -178,3 +178,12 @@ def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsy
     ):
         assert cli.main(["refine", words[0], str(out), *words[1:]]) != 0
         assert message in capsys.readouterr().err
+
+
+def test_the_plot_is_of_the_first_scene_with_people(crowded: Scene, tmp_path: Path) -> None:
+    walkers = crowded.slice(0, 12)
+    nobody = empty_scene(1, 12, 2, walkers.betas)
+    scene, plot = concatenate([nobody, walkers]).save(tmp_path / "two.npz"), tmp_path / "over_time.svg"
+    assert cli.main(["refine", str(scene), str(tmp_path / "out.npz"), "--plot", str(plot)]) == 0
+    depth, *_ = re.findall(r'<polyline points="([^"]*)" class="before"', plot.read_text())
+    assert len({point.partition(",")[2] for point in depth.split()}) > 1  # of two in one place, no flat line
