@@ -21,7 +21,7 @@ from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
-from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
+from magnet.motion.scene import Scene, cat_time, empty_scene, require_one, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
@@ -82,7 +82,8 @@ class Live:
         model: a trained denoiser.
         people: how many there are when a scene begins from nothing.
         start: a scene (B = 1) to go on from instead; whoever is present moves up to the first slots.
-        partner: recorded motion of whoever is given, in the same frames as the scene that grows.
+        partner: recorded motion (B = 1) of everybody, from which whoever is given is taken, in the same frames as the
+            scene that grows; whoever is present moves up to the first slots, as in `start`.
         generator: source of all randomness.
 
     Attributes:
@@ -106,7 +107,9 @@ class Live:
         self.generator = generator or torch.Generator(device=model.device).manual_seed(1)
         if partner is not None:
             require_rate(partner, "partner")
+            require_one(partner)
             check_given(partner, torch.ones(partner.frames // TOKEN_FRAMES, partner.agents, dtype=torch.bool))
+            partner = partner.permute_agents(partner.present[0].nonzero()[:, 0])
         self.partner = partner
         self.settings = LiveSettings()
         self.keys: list[Keyframe] = []
@@ -337,8 +340,14 @@ class Live:
         return self._lead(scene, past, now, whole, frames) if bool(whole.any()) else scene
 
     def _lead(self, scene: Scene, past: Scene, now: int, agents: Tensor, frames: int) -> Scene:
-        """Fill in the whole future of some agents before the task runs. agents (P,) bool"""
+        """Fill in the whole future of some agents before the task runs. agents (P,) bool
+
+        Raises:
+            ValueError: the `partner` is a recording of another number of people.
+        """
         if self.partner is not None and self.partner.frames >= now + frames:
+            if self.partner.agents != scene.agents:
+                raise ValueError(f"partner: got {self.partner.agents} people, expected the scene's {scene.agents}")
             source = self.partner.slice(now - CONTEXT, now + frames)
             source = source.replace(given=torch.ones(source.T_world_root.shape[:3], dtype=torch.bool))
         else:

@@ -186,6 +186,18 @@ def test_a_partners_recording_is_given_as_it_is(model) -> None:
     torch.testing.assert_close(live.scene.T_world_root[:, 40:56, 1], recorded.T_world_root[:, 40:56, 1])
 
 
+def test_a_recorded_partner_has_the_people_of_the_scene_whatever_their_slots(model) -> None:
+    present = torch.tensor([[False, True, True]])
+    recorded = random_scene(1, 80, 3, torch.Generator().manual_seed(2), present)
+    live = Live(model, start=recorded.slice(0, 40), partner=recorded, generator=torch.Generator().manual_seed(3))
+    live.settings.task, live.settings.steps = "motion_control", 2
+    live.advance()
+    assert torch.equal(live.scene.T_world_root[:, 40:56, 1], recorded.T_world_root[:, 40:56, 2])
+    live.begin(3)
+    with pytest.raises(ValueError, match="partner: got 2 people, expected the scene's 3"):
+        live.advance()
+
+
 def test_nobody_is_asked_to_run_faster_than_people_do() -> None:
     here = torch.eye(4)
     assert reached(here, Goal(100.0, 0.0, 0.0), 1.0).x == pytest.approx(1.6)
