@@ -43,9 +43,11 @@ from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
 from magnet.tasks.base import Task, schedule_of
 
-CHUNK, FEW = 64, 8
-"""Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk; and that are encoded at a
-time where what is final is handed out at once."""
+CHUNK = 64
+"""Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk."""
+
+ENCODED = 8
+"""Token steps that are encoded at a time where what is final is handed out at once."""
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
@@ -280,7 +282,7 @@ class Rollout:
 
     def _ask_for(self, stage: Stage) -> None:
         """Note whose predictions are read: tokens that the stage changes and, in its last step, those behind them."""
-        self._left = len(stage.levels) - 1
+        self._steps_left = len(stage.levels) - 1
         # A token that is known may hold pairwise transforms to somebody who is not.
         begins, ends = (self.model.layout.group_levels(levels) for levels in stage.levels[[0, -1]])
         changes = (begins != ends).any(dim=-1)
@@ -291,16 +293,12 @@ class Rollout:
         self._memory: Memory | None = Memory(rows[0] // block * block if block else 0, (rows[0], rows[-1] + 1))
 
     def _network(self) -> Callable[..., Tensor]:
-        """What predicts: the transformer as it was trained, or its lean form."""
+        """What predicts: the transformer as it was trained, or its lean form, which predicts only what is read."""
         network, precision = self.model.transformer, self.options.precision
         smooth = self.options.guidance.smooth  # by a gradient, which packed weights have not
         if precision == "reference" or smooth or dtype_of(network) != torch.float32:
             return network
-        whole = self.model.posterior is not None
-        self._left -= 1
-        if self._left == 0 and self.expected.most:
-            self._asked[len(self._asked) - self._ahead :] = True
-        asked = None if whole else self._asked
+        asked = self._asked if self.model.posterior is None else None
         packed = self._packed = self._packed or lean(network, precision)  # a stage looks once whether weights changed
         return functools.partial(packed, wanted=asked, memory=self._memory, compiled=self.options.compile)
 
@@ -316,6 +314,9 @@ class Rollout:
 
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
+        self._steps_left -= 1
+        if self._steps_left == 0 and self.expected.most:  # what is expected next is kept, see `Expected`
+            self._asked[len(self._asked) - self._ahead :] = True
         if self._ahead:  # nobody's: shown as the mean of pure noise, which tells nothing of anybody
             noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
             levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
@@ -359,7 +360,7 @@ class Rollout:
         """Add rows, whole chunks at a time, until those before `stop` are held."""
         behind, ahead = receptive_field(self.model)
         while self.stop < min(stop, self.there):
-            last = int(min(self.stop + (self.chunk or FEW), self.there))
+            last = int(min(self.stop + (self.chunk or ENCODED), self.there))
             # What is known is encoded with all the neighbours that its codes can depend on.
             low, high = max(self.stop - behind - 1, 0), int(min(last + ahead + 1, self.there))
             known, given = self._known(low, high), self._given(low, high)

@@ -79,9 +79,9 @@ class WorldState:
         self.since: Tensor | None = None  # token steps to the first row from each one's last given one before it
         self.rooted = False  # whether something was known in rows that have been let go
         self.causal, self._lookahead_limit, self.released = schedule.causal, lookahead_limit(schedule), 0
-        self.correction: Corrected | None = None  # of the last two frames shown, in causal plans; in others:
-        self.chunk: Corrected | None = None
-        self.uncorrected: Scene | None = None  # those frames of a causal plan without it
+        self.correction: Corrected | None = None  # of the last two frames shown, in causal plans
+        self.uncorrected: Scene | None = None  # the same two frames before they were corrected
+        self.chunk_correction: Corrected | None = None  # of the chunk before, in all other plans
         self.finalized = 0  # rows of a causal plan whose bodies are final, and given from then on
         self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
@@ -380,7 +380,7 @@ class WorldState:
         if self.settle is not None:
             fixed, goes_on = self.by_frame(self.known[first:stop]), self.placed[first:stop].all(dim=0).to(tokens.device)
             seen = decoded.replace(present=decoded.present & goes_on)  # nobody makes way for whom nothing is known of
-            made, self.chunk = settled_chunk(seen, fixed, self.settle, self.chunk)
+            made, self.chunk_correction = settled_chunk(seen, fixed, self.settle, self.chunk_correction)
             decoded = made.replace(present=decoded.present)
         return freeze_after(decoded, self.by_frame(self.placed[first:stop]), before)
 
