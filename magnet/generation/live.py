@@ -46,6 +46,8 @@ class LiveSettings:
     Attributes:
         task: a name in the registry.
         fields: the task's own options, where they differ from its defaults.
+        steps: denoising steps.
+        guidance: see `Guidance`; this and `steps` count, not those of `sampler`.
         chunk: frames of a chunk, whole tokens.
         goals: where agents (slots) are steered to; see `Live`.
         sampler: all other options of sampling.
@@ -329,7 +331,10 @@ class Live:
         return scene.replace(given=known.expand(scene.T_world_root.shape[:3]))
 
     def _future(self, past: Scene, now: int, known: Tensor, frames: int) -> Scene:
-        """The past and what the task is given of what comes after. known (N, P)"""
+        """The past and what the task is given of what comes after. -> `CONTEXT` + `frames` frames
+
+        past: the last `CONTEXT` frames; now: the frame of the whole scene behind them; known: (N, P) bool, of both
+        """
         coming = known[CONTEXT // TOKEN_FRAMES :]
         scene = self._held(past, frames)
         if not bool(coming.any()):
@@ -340,7 +345,7 @@ class Live:
         return self._lead(scene, past, now, whole, frames) if bool(whole.any()) else scene
 
     def _lead(self, scene: Scene, past: Scene, now: int, agents: Tensor, frames: int) -> Scene:
-        """Fill in the whole future of some agents before the task runs. agents (P,) bool
+        """Fill in the whole future of some agents (P,) bool before the task runs; the rest as for `_future`.
 
         Raises:
             ValueError: the `partner` is a recording of another number of people.

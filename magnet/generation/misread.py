@@ -18,6 +18,8 @@ from magnet.motion.scene import FPS, Scene
 
 Floats = NDArray[np.float64]
 
+PELVIS = 0.9
+"""Metres over the floor at which a standing person has it."""
 FAST, APART = 10.0, 25.0
 """m/s that no pelvis moves for a quarter of the time, and metres that people are not apart who have to do with each
 other."""
@@ -54,15 +56,15 @@ def misread(scene: Scene, counts: Tensor, low: Tensor, step: Tensor) -> tuple[in
         if said := _turned(scene.select([b]), low[b], counts[b]):
             return b, said
     pelvis = scene.T_world_root[..., :3, 3]
-    times = pelvis[..., 1] / (pelvis[..., 1] - low).clamp(min=0.1)  # how much higher than over the lowest point
-    times = torch.where(counts, times, torch.inf).flatten(1).amin(dim=1)  # about 1 of who was put onto the floor
-    speeds = step.flatten(1).nanquantile(0.75, dim=1) * FPS if step.numel() else torch.zeros_like(times)
+    raised = pelvis[..., 1] / (pelvis[..., 1] - low).clamp(min=0.1)  # height over y = 0 by that over the lowest point
+    raised = torch.where(counts, raised, torch.inf).flatten(1).amin(dim=1)  # about 1 of who was put onto the floor
+    speeds = step.flatten(1).nanquantile(0.75, dim=1) * FPS if step.numel() else torch.zeros_like(raised)
     apart = _apart(pelvis, counts)
-    far = something & ((times > UNITS["m"] / UNITS["inch"] / ROUGHLY) | (speeds > FAST) | (apart > APART))
+    far = something & ((raised > UNITS["m"] / UNITS["inch"] / ROUGHLY) | (speeds > FAST) | (apart > APART))
     if not bool(far.any()):
         return None
     b = int(far.nonzero()[0, 0])
-    return b, _of_unit(*(float(number[b]) for number in (times, speeds, apart)))
+    return b, _of_unit(*(float(number[b]) for number in (raised, speeds, apart)))
 
 
 def steps_of(scene: Scene, counts: Tensor, frames: Tensor, most: int) -> Tensor:
@@ -96,17 +98,20 @@ def _apart(pelvis: Tensor, counts: Tensor) -> Tensor:
     return torch.where(nearest.isfinite(), nearest, torch.nan).flatten(1).nanmedian(dim=1).values
 
 
-def _of_unit(times: float, speed: float, apart: float) -> str:
-    """What is too large for metres, the unit that it suggests, and what to do."""
-    measured = [(times > 10, times * 0.9, "pelvises are {:.0f} m over y = 0")]
+def _of_unit(raised: float, speed: float, apart: float) -> str:
+    """What is too large for metres, the unit that it suggests, and what to do.
+
+    raised: how many times as high as a body can have it the lowest pelvis is; speed: m/s; apart: m
+    """
+    measured = [(raised > 10, raised * PELVIS, "pelvises are {:.0f} m over y = 0")]
     measured += [
         (apart > APART, apart, "people are {:.0f} m apart"),
         (speed > FAST, speed, "pelvises move at {:.0f} m/s"),
     ]
     seen = " and ".join(text.format(number) for strange, number, text in measured if strange)
-    names = [name for name in ("mm", "cm", "inch") if 1 / ROUGHLY < times * UNITS[name] < ROUGHLY]
+    names = [name for name in ("mm", "cm", "inch") if 1 / ROUGHLY < raised * UNITS[name] < ROUGHLY]
     # Without a height nothing tells units apart; centimetres are by far the most frequent.
-    name = min(names, key=lambda name: abs(np.log(times * UNITS[name])), default="cm")
+    name = min(names, key=lambda name: abs(np.log(raised * UNITS[name])), default="cm")
     sure = f"as if in {name}" if names else f"as if in another unit than metres, such as {name}"
     return (
         f"{seen}, {sure}: bring T_world_root[..., :3, 3] to metres (times {UNITS[name]:g} from {name}), then "
