@@ -8,7 +8,9 @@ from torch.nn import functional as F
 
 from magnet.body.apart import lifted
 from magnet.body.base import Body
+from magnet.body.fixed import fixed_anywhere
 from magnet.body.holding import holds
+from magnet.body.indices import pairs_of
 from magnet.body.joints import FEET, TOES
 from magnet.body.settle_wishes import SLIDES, Wishes
 from magnet.motion.frames import from_planar
@@ -68,8 +70,8 @@ def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: flo
     joints = body.joints(scene)
     velocity = drift(joints, wishes.stands, scene.fps)
     if fixed is not None:
-        whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
-        velocity = torch.where(whole.to(velocity.device)[..., None], 0.0, velocity)
+        stays = fixed_anywhere(fixed).to(velocity.device)
+        velocity = torch.where(stays[..., None, :, None], 0.0, velocity)
     offsets = -velocity.cumsum(dim=1) / scene.fps
     least = KEPT * frames_held(joints, scene.present)
     for _ in range(scene.agents):  # whoever stays may take from those who move
@@ -80,10 +82,9 @@ def undrifted(scene: Scene, body: Body, fixed: Tensor | None = None, slides: flo
 
 def frames_held(joints: Tensor, present: Tensor) -> Tensor:
     """In how many frames everybody holds hands, added up over partners. (B, T, P, 22, 3), (B, P) -> (B, P)"""
-    P = joints.shape[2]
     held = holds(joints, present)[0].flatten(3).any(dim=-1).sum(dim=1)  # (B, Q)
-    first, second = torch.triu_indices(P, P, 1, device=held.device)
-    frames = held.new_zeros(len(held), P)
+    first, second = pairs_of(joints.shape[2], held.device)
+    frames = held.new_zeros(present.shape)
     return frames.index_add_(1, first, held).index_add_(1, second, held)
 
 

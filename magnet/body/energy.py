@@ -13,7 +13,7 @@ from torch import Tensor
 
 from magnet.body.capsules import CAPSULES, nearest_points
 from magnet.body.fitted_capsules import FOREARMS, HANDS, LEGS, PARTS, TRUNK, UPPER_ARMS
-from magnet.body.indices import indices
+from magnet.body.indices import indices, pairs_of
 
 from magnet.body.joints import (  # isort: skip
     ANKLES, ELBOWS, HEAD, HIPS, KNEES, NECK, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
@@ -151,7 +151,7 @@ def pair_energy(ends: Tensor, radius: Tensor, seen: Tensor, contact: Contact) ->
     """
     P, radius = ends.shape[2], radius[:, None].expand(ends.shape[:4])
     total = ends.new_zeros(ends.shape[:2])
-    first, second = torch.triu_indices(P, P, 1, device=ends.device)
+    first, second = pairs_of(P, ends.device)
     if len(first):
         depth = capsule_depth(ends[:, :, first], radius[:, :, first], ends[:, :, second], radius[:, :, second])
         found = excess(depth, allowed_between(contact)).square().sum(dim=(-1, -2))

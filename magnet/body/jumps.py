@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from magnet.body.base import Body
+from magnet.body.fixed import fixed_anywhere
 from magnet.motion.scene import FPS, Scene
 
 JUMP = 0.04
@@ -53,8 +54,7 @@ def unjumped(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
     if scene.valid is not None:
         jumped = torch.where((scene.valid[:, 1:] & scene.valid[:, :-1])[..., None], jumped, 0.0)
     if fixed is not None:
-        whole = fixed if fixed.ndim == 1 else fixed.any(dim=-2, keepdim=True)
-        jumped = torch.where(whole.to(jumped.device), 0.0, jumped)
+        jumped = torch.where(fixed_anywhere(fixed).to(jumped.device)[..., None, :], 0.0, jumped)
     height = scene.T_world_root.clone()
     raised = F.pad(jumped.cumsum(dim=1), (0, 0, 1, 0))  # (B, T, P)
     first_second = raised[:, : max(round(scene.fps), 1)]

@@ -15,6 +15,7 @@ from magnet.body.base import Body
 from magnet.body.contact import depth_between
 from magnet.body.drift import moved_over_ground, undrifted
 from magnet.body.energy import CONTACT
+from magnet.body.fixed import fixed_anywhere, fixed_in, fixed_of
 from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
 from magnet.body.indices import pairs_of
 from magnet.body.jumps import unjumped
@@ -103,7 +104,7 @@ def repaired(
         scene = undrifted(unjumped(grounded(scene, body, fixed), body, fixed), body, fixed, slides)
     few = torch.arange(0, scene.frames, every, device=scene.device)
     seen = scene.frames_at(few).replace(fps=scene.fps / every)
-    stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., few, :]
+    stay = fixed_in(fixed, few)
     offset = settling(seen, body, how, stay, settle, begun, slides=slides)
     if settle is None:
         offset = pressed(seen, body, offset, how, stay, begun, slides)
@@ -126,9 +127,8 @@ def pressed(
     deep = stays.any(dim=1).nonzero()[:, 0]
     if not len(deep):
         return offset
-    few, still = scene.select(deep), None if fixed is None else fixed.to(deep.device)
-    if still is not None and still.ndim == 3 and len(still) == scene.scenes:
-        still = still[deep]
+    few = scene.select(deep)
+    still = fixed_of(None if fixed is None else fixed.to(deep.device), deep, scene.scenes)
     again = settling(few, body, how, still, STUBBORN, begun, slides=slides)
     share = eased(stays[deep].to(again), AROUND)
     again = torch.lerp(offset[deep], again, share[..., None, None])
@@ -150,7 +150,7 @@ def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
     most = JUMPED if scene.frames < JUMP * max(scene.fps / FPS, 1.0) else OFF
     far = ((height > most).all(dim=1) | (height < -OFF).all(dim=1)) & scene.present
     if fixed is not None:
-        far &= ~(fixed.to(far.device) if fixed.ndim == 1 else fixed.to(far.device).any(dim=-2))
+        far &= ~fixed_anywhere(fixed.to(far.device))
     if not bool(far.any()):
         return scene
     root = scene.T_world_root.clone()
@@ -163,18 +163,12 @@ def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, each: Callabl
     assert scene.valid is not None
     made = []
     for b, valid in enumerate(scene.valid.cpu()):
-        still = (
-            fixed
-            if fixed is None or fixed.ndim == 1
-            else fixed[b if len(fixed) > 1 else 0]
-            if fixed.ndim == 3
-            else fixed
-        )
+        still = fixed_of(fixed, slice(b, b + 1), scene.scenes)
         pieces, begin = [], 0
         for run, count in zip(*(each.tolist() for each in valid.unique_consecutive(return_counts=True)), strict=True):
             piece = scene.select([b]).slice(begin, begin + count).replace(valid=None)
             if run:
-                kept = still if still is None or still.ndim == 1 else still[begin : begin + count]
+                kept = fixed_in(still, slice(begin, begin + count))
                 piece = each(piece, fixed=kept, begun=begun and not begin)
             pieces.append(piece)
             begin += count
@@ -204,7 +198,7 @@ def settling(
     made = []
     for start in range(0, B, few):
         some = slice(start, start + few)
-        still = fixed[some] if fixed is not None and fixed.ndim == 3 and len(fixed) == B else fixed
+        still = fixed_of(fixed, some, B)
         before, hold = (None if each is None else each[some] for each in (past, holding))
         ends = None if last is None else (last[0][some], last[1][some])
         made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold, ends))

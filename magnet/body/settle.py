@@ -13,6 +13,7 @@ from torch import Tensor
 
 from magnet.body.base import Body
 from magnet.body.fitted_capsules import fit_capsules, with_measured
+from magnet.body.fixed import fixed_in
 from magnet.body.indices import indices
 from magnet.body.joints import ANKLES, COLLARS, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
 from magnet.body.settle_goals import Goals
@@ -136,7 +137,7 @@ def correction(
         parts: list[Tensor] = []
         for start in range(0, T, WINDOW):
             stop = min(start + WINDOW + AHEAD, T)
-            stay = fixed if fixed is None or fixed.ndim == 1 else fixed[..., start:stop, :]
+            stay = fixed_in(fixed, slice(start, stop))
             push = None if toward is None else toward[:, start:stop]
             more = (stay, settle, begun or start > 0, parts[-1][:, -LEAD:] if parts else past, push)
             made = correction(scene.slice(start, stop), body, wishes.slice(start, stop), *more)
