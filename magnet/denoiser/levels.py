@@ -29,13 +29,15 @@ FROM_NOTHING_MIXED = 0.6
 """Share of roll-outs with mixed roles without any past: with one, where a partner is need not be told from the other's
 motion, as inpainting must. Where everybody is generated it is `NoiseOptions.from_nothing`."""
 
-ROLES = (0.45, 0.1, 0.37, 0.08)
-"""Shares, in mixed roll-outs, of agents who are generated, given as far as the block reaches, given, and hidden; one
-of the agents is generated whatever is drawn."""
+GENERATED, GIVEN_SO_FAR, GIVEN, HIDDEN = range(4)
+"""What an agent's tokens are: generated, given as far as the block reaches, given to the end, hidden from the block
+on."""
 
-LIVE_ROLES = (0.45, 0.33, 0.22)
-"""Shares, in live scenes, of agents who are generated, given as far as the block reaches, and hidden from it on; one
-is generated whatever is drawn."""
+ROLES = (0.45, 0.1, 0.37, 0.08)
+"""Shares of these in mixed roll-outs; one of the agents is generated whatever is drawn."""
+
+LIVE_ROLES = (0.45, 0.33, 0.0, 0.22)
+"""The same in live scenes, where nobody's end is given."""
 
 UNKNOWN_AFTER = 3
 """Token steps of unknown future that live tasks show after a block at least (`magnet.sampling.schedule.AHEAD`); in
@@ -97,12 +99,12 @@ def drawn_kinds(shares: Sequence[float], shape: tuple[int, ...], generator: torc
 def drawn_roles(
     shares: Sequence[float], B: int, P: int, generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
-    """A role for each agent, and the first of them, generated, for one at least of those who are there. -> (B, 1, P)"""
+    """A role for each agent; one at least of those who are there is `GENERATED`. -> (B, 1, P) int"""
     role = drawn_kinds(shares, (B, 1, P), generator)
     lot = torch.rand(B, 1, P, generator=generator, device=generator.device)
     if present is not None:
         lot = lot.where(present[:, None], -1.0)
-    return torch.where(lot == lot.amax(dim=2, keepdim=True), 0, role)
+    return torch.where(lot == lot.amax(dim=2, keepdim=True), GENERATED, role)
 
 
 def rollout_levels(
@@ -148,10 +150,10 @@ def rollout_levels(
     generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
-    role = torch.where(mixed, drawn_roles(ROLES, B, P, generator, present), 0)
-    levels = torch.where(role == 1, given, generated)
-    levels = torch.where(role == 2, torch.zeros_like(levels), levels)
-    return torch.where(role == 3, hidden, levels)
+    role = torch.where(mixed, drawn_roles(ROLES, B, P, generator, present), GENERATED)
+    levels = torch.where(role == GIVEN_SO_FAR, given, generated)
+    levels = torch.where(role == GIVEN, torch.zeros_like(levels), levels)
+    return torch.where(role == HIDDEN, hidden, levels)
 
 
 def live_levels(
@@ -176,6 +178,6 @@ def live_levels(
         (draw[4] < noise.faint_past) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0
     )
     role = drawn_roles(LIVE_ROLES, B, P, generator, present)
-    shown = torch.where(role == 1, 0, behind)
-    block = torch.where(role == 0, level, torch.where(role == 1, 0, LEVELS))
+    shown = torch.where(role == GIVEN_SO_FAR, 0, behind)
+    block = torch.where(role == GENERATED, level, torch.where(role == GIVEN_SO_FAR, 0, LEVELS))
     return torch.where(time < past, shown, torch.where(time < stop, block, LEVELS))
