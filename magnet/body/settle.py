@@ -25,7 +25,8 @@ from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 MOVED: tuple[int, ...] = (0, SPINE2, *COLLARS, *HIPS, *KNEES, *ANKLES, *SHOULDERS, *ELBOWS)
-"""Joints that are turned; turning the pelvis turns the whole body. `Smoothness` knows the places of the first four."""
+"""Joints that are turned; turning the pelvis turns the whole body. `magnet.body.settle_steps` knows the places of the
+first four."""
 
 LIMBS = tuple(joint - 1 for joint in MOVED[1:])
 """Where their rotations are among those of the body."""

@@ -29,6 +29,10 @@ STIFF = 1e9
 SOFT = 0.005
 """Metres around 0 over which a one-sided residual comes to count: a hair's breadth must not decide about a step."""
 
+SHIFTED, TILTED, SHRUGGED = slice(0, 3), slice(3, 9), slice(9, 15)
+"""Places among the numbers that correct a pose (`magnet.body.settle.DOFS`): the root's shift, turns of the pelvis and
+the back, turns of the collars."""
+
 DONE = 1e-10
 """Squared norm of the preconditioned residual at which conjugate gradients stop."""
 
@@ -90,14 +94,16 @@ class Smoothness:
         settle: the costs.
         free: (B, T, P) bool, who may move.
         past: (B, L, P, DOFS) corrections just before, which stay; None: none.
+        like: (B, T, P, DOFS) of the dtype and device of corrections.
     """
 
     def __init__(self, settle: Settle, free: Tensor, past: Tensor | None, like: Tensor) -> None:
         self.past, self.lead = past, 0 if past is None else past.shape[1]
         self.start = torch.zeros_like(like)  # corrections that cost nothing
         self.scale = torch.ones(like.shape[-1], dtype=like.dtype, device=like.device)
-        self.scale[:3], self.scale[3:9], self.scale[9:15] = settle.root, settle.tilt, min(settle.shrug, STIFF)
-        self.scale[1] *= settle.lift
+        self.scale[SHIFTED], self.scale[TILTED] = settle.root, settle.tilt
+        self.scale[SHRUGGED] = min(settle.shrug, STIFF)
+        self.scale[1] *= settle.lift  # along y
         whole = stiffness(settle, self.lead + free.shape[1])
         # In double precision: it ends nearly in nothing where a correction is smooth, and threads split its sums.
         self.cost = whole.to(like.device)[self.lead :]  # (T, L + T)
