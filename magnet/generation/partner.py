@@ -25,12 +25,12 @@ SAME_SHAPE = 1e-2
 FASTEST = 1.0
 """Metres that somebody given moves from one frame to the next, at most: 30 m/s. Whoever moves further has jumped."""
 
-LEAD = (
+LEAD_THERE = (
     "keep held = partner.past and lead them there over a second, magnet.export.bridged(held, frames, 32, since), with "
     "since 0, 4, ... 28; or begin a new Partner from frames behind the jump"
 )
-FROM_BEHIND = "begin from what lies behind the jump, past.slice({})"
-"""What to do about a jump, live and in the past."""
+BEGIN_BEHIND = "begin from what lies behind the jump, past.slice({})"
+"""What to do about a jump: live, and in the past."""
 
 
 def places(scene: Scene) -> NDArray[np.float32]:
@@ -72,8 +72,7 @@ class Partner:
         check_request(denoiser, past, 0, 0, 1)
         if past.frames < TOKEN_FRAMES:
             raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")
-        self.denoiser, self.task = denoiser, MotionControl(target=tuple(agents), block=block)
-        self.options, self.generator = options or SamplerOptions(), generator
+        self.task = MotionControl(target=tuple(agents), block=block)
         chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
         self._present, self._betas, self._body = past.present.cpu(), past.betas.cpu().float(), past.body
         self._given = torch.tensor([agent not in self.task.target for agent in range(past.agents)])
@@ -81,7 +80,7 @@ class Partner:
         begins = past.frames % TOKEN_FRAMES
         _require_valid("past", past, begins)
         whole = past.slice(begins).replace(valid=None, given=None)
-        self.stream = OnlineRollout(denoiser, whole, self.task, self.options, generator)
+        self.stream = OnlineRollout(denoiser, whole, self.task, options, generator)
         there = places(past)
         self._places = there[:, begins]
         self._require_steps("past", there[:, begins:], begins)
@@ -164,7 +163,7 @@ class Partner:
             frame = begins + row
             raise ValueError(
                 f"{name}: agent {agent} moves {steps[b, row, agent]:.1f} m to frame {frame}, expected at most "
-                f"{FASTEST:g}: {FROM_BEHIND.format(frame) if name == 'past' else LEAD}"
+                f"{FASTEST:g}: {BEGIN_BEHIND.format(frame) if name == 'past' else LEAD_THERE}"
             )
 
     def _require_shapes(self, frames: Scene) -> None:
