@@ -112,7 +112,7 @@ class BodyGuidance:
             T_world_can = torch.cat([before, T_world_can], dim=1)
         decoded = latent[:, low:high], deltas[:, low:high]
         moved = moves[low:stop]
-        bend, shift = self._slopes(*decoded, T_world_can, frames, moved, seen)
+        bend, shift = self._moves(*decoded, T_world_can, frames, moved, seen)
         latent = latent.clone()
         latent[:, low:stop] += bend
         deltas, pairs = moved_along(deltas, pairs, T_world_can, shift, low, stop)
@@ -136,10 +136,18 @@ class BodyGuidance:
         return torch.where(stands, world.T_world_can[:, frames], made)
 
     @torch.enable_grad()
-    def _slopes(
+    def _moves(
         self, latent: Tensor, deltas: Tensor, T_world_can: Tensor, frames: slice, moves: Tensor, seen: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What to add to latents (B, n, P, C) and to places (B, 4 n, P, 2). moves (n, P) bool, seen (B, P) bool"""
+        """What to add to latents and to places, down the energy's slope. -> (B, n, P, C), (B, 4 n, P, 2) metres
+
+        Args:
+            latent, deltas: (B, n + 1 or n, P, ...) of the rows and, where there is one, of that behind them.
+            T_world_can: (B, 4 n, P, 4, 4) where people stand.
+            frames: of the world, in these rows.
+            moves: (n, P) bool, who may be moved.
+            seen: (B, P) bool, who counts.
+        """
         with torch.inference_mode(False):  # Lightning tests in inference mode, whose tensors no gradient may pass
             world, body = self.world, open_body_on(latent.device)
             slots = world.given.present.any(dim=0).nonzero()[:, 0]
@@ -187,7 +195,10 @@ class BodyGuidance:
     def _steps(
         self, latent: Tensor, by_latent: Tensor, by_place: Tensor, energy: Tensor, moves: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Polyak steps, half of the energy to be taken out by latents and half by places."""
+        """Polyak steps, half of the energy to be taken out by latents and half by places. -> as `_moves`
+
+        latent, by_latent (B, n, P, C) and by_place (B, 4 n, P, 2) the energy's slopes; energy (B, 4 n); moves (n, P)
+        """
         who = moves.repeat_interleave(TOKEN_FRAMES, dim=0)
         by_place = torch.where(who[..., None], by_place, 0.0)
         by_latent = torch.where(moves[..., None], by_latent, 0.0)

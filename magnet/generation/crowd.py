@@ -118,7 +118,7 @@ class CrowdRollout(Rollout):
             require_crowd(model, scene, context, options)
             self.settle = options.filled(model.sampling).settle or "off"
             self._settled: SettledGroups = {}
-            self._sight = options.crowd_enter, options.crowd_leave
+            self._partner_radii = options.crowd_enter, options.crowd_leave
             beside = replace(options.guidance, stabilization_beside=0)  # somebody who is given may be far away
             apart = "firm" if options.apart == "off" else options.apart
             options = replace(options, settle="off", apart=apart, guidance=beside)
@@ -149,7 +149,7 @@ class CrowdRollout(Rollout):
             both = self._present[:, None] & self._present & (person[:, None] != person)
             self._bonds = (away < BOND) & both
             nobody = person[:, None].repeat(1, slots - 1)
-            table = nearest_partners(stood[-1], self._present, nobody, self._bonds, *self._sight)
+            table = nearest_partners(stood[-1], self._present, nobody, self._bonds, *self._partner_radii)
         else:
             table = self.viewer.layout.partners(self.viewer.device)
         self._point(table)
@@ -183,7 +183,7 @@ class CrowdRollout(Rollout):
         person = torch.arange(len(last), device=last.device)
         T_world_now = self.world.T_world_can[0, last * TOKEN_FRAMES + TOKEN_FRAMES - 1, person]
         before = self.model.layout.partners(last.device)
-        table = nearest_partners(to_planar(T_world_now)[1], self._present, before, self._bonds, *self._sight)
+        table = nearest_partners(to_planar(T_world_now)[1], self._present, before, self._bonds, *self._partner_radii)
         who, slot = (table != before).nonzero(as_tuple=True)
         if not len(who):
             return
