@@ -109,7 +109,8 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
     """Groups on one floor: in the cells of a grid that is as square as possible, turned by chance.
 
     Args:
-        groups: single scenes of the same length; taken in turns, again and again. What is not present is left out.
+        groups: single scenes of the same length, frame rate and body; taken in turns, again and again. What is not
+            present is left out.
         people: how many in all; of the last group no more than are needed.
         generator: of the turns, on the CPU.
         spacing: metres between the middles of neighbouring cells.
@@ -118,7 +119,7 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
         One scene of `people`, all present, in the middle of the floor.
 
     Raises:
-        ValueError: there are no groups or nobody in them, or counts that are none.
+        ValueError: there are no groups or nobody in them, they differ, or counts that are none.
     """
     require_whole("people", people, 1)
     require_number("spacing", spacing, over=0)
@@ -126,6 +127,11 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
         raise ValueError(
             "groups: got none, several in one, or an empty one; expected single scenes with people in them"
         )
+    for field in ("frames", "fps", "body"):
+        if len(several := {getattr(one, field) for one in groups}) > 1:
+            raise ValueError(
+                f"groups: {field} differ, got {', '.join(map(str, sorted(several)))}; expected one for all"
+            )
     parts: list[Scene] = []
     count = 0
     while count < people:

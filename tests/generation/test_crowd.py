@@ -263,6 +263,17 @@ def test_groups_stand_in_the_cells_of_a_floor_and_keep_their_shape() -> None:
     torch.testing.assert_close(pairwise(scene.T_world_root[:, :, :2]), pairwise(couple.T_world_root), rtol=0, atol=1e-4)
 
 
+def test_groups_that_do_not_go_together_are_refused() -> None:
+    couple = random_scene(1, 20, 2, torch.Generator().manual_seed(0))
+    for other, said in (
+        (couple.slice(4), "groups: frames differ, got 16, 20"),
+        (couple.replace(fps=60.0), "groups: fps differ, got 30.0, 60.0"),
+        (couple.replace(body="smplx-neutral"), "groups: body differ, got open-1, smplx-neutral"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            compose([couple, other], 4, torch.Generator())
+
+
 def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -> None:
     scene = start_crowd(model, 7, QUICK, seeded())
     assert (scene.scenes, scene.frames, scene.agents) == (1, 32, 7)
