@@ -111,6 +111,7 @@ class Live:
             require_rate(partner, "partner")
             require_one(partner)
             check_given(partner, torch.ones(partner.frames // TOKEN_FRAMES, partner.agents, dtype=torch.bool))
+            partner = partner.to("cpu").to_float32()
             partner = partner.permute_agents(partner.present[0].nonzero()[:, 0])
         self.partner = partner
         self.settings = LiveSettings()
@@ -132,7 +133,8 @@ class Live:
             scene = self._from_nothing(people)
         else:
             self._check(start)
-            scene = start.permute_agents(start.present[0].nonzero()[:, 0])
+            scene = start.to("cpu").to_float32()  # as its chunks are
+            scene = scene.permute_agents(scene.present[0].nonzero()[:, 0])
             scene = scene.slice(0, start.frames // TOKEN_FRAMES * TOKEN_FRAMES).replace(valid=None)
             if scene.given is None:
                 scene = scene.replace(given=torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool))

@@ -98,6 +98,18 @@ def test_a_recorded_start_is_gone_on_from_and_gaps_in_its_slots_are_closed(model
     assert live.scene.frames == 56
 
 
+def test_a_start_in_double_precision_is_gone_on_from_as_in_single(model) -> None:
+    start, made = random_scene(1, 40, 2, torch.Generator().manual_seed(2)), []
+    floats = {name: value.double() for name, value in start.tensors().items() if value.is_floating_point()}
+    for each in (start, start.replace(**floats)):
+        live = Live(model, start=each, partner=each, generator=torch.Generator().manual_seed(3))
+        live.settings.steps = 2
+        for live.settings.task in ("joint_future", "motion_control", "inbetweening"):
+            live.advance()
+        made.append(live.scene)
+    assert torch.equal(made[0].T_world_root, made[1].T_world_root)
+
+
 def test_what_cannot_be_started_from_is_refused(model) -> None:
     with pytest.raises(ValueError, match="people: got 4, expected 1 to 3"):
         Live(model, 4)
