@@ -24,7 +24,7 @@ from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_cro
 from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
-from magnet.generation.unmade import completed
+from magnet.generation.unmade import completed, given_invalid
 from magnet.motion.scene import FPS, Scene, require_rate
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
@@ -263,7 +263,8 @@ class Model:
     ) -> Motion:
         """Sample any task with its options `fields`; `magnet tasks` lists both.
 
-        Whoever the task does not make is as recorded where the scene goes on, and else stands still.
+        Whoever the task does not make is as recorded where the scene goes on, and else stands still. Given frames that
+        are marked as not valid are read as they are, with a warning.
 
         Args:
             context: frames given of everybody at the start, a multiple of 4.
@@ -288,12 +289,15 @@ class Model:
             has = f"it has {', '.join(known)}" if known else "it has none"
             raise ValueError(f"task {task} has no field {strange[0]}; {has}")
         chosen: Task = kind(**fields)
+        plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
+        if bool((bad := given_invalid(plain, plan.known)).any()):
+            first = int(bad.nonzero()[0])
+            warnings.warn(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid", stacklevel=2)
         generator = self._generator(seed)
         how = (context, frames, samples, self.sampler, generator)
         sample = generate if slots <= self.most_people else generate_crowd
         sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
         shown = sampled.permute_agents(torch.arange(slots))
-        plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
         return Motion.of(completed(shown, plain.to("cpu"), ~plan.finished), body)
 
     def _generator(self, seed: int | None) -> torch.Generator:

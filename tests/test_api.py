@@ -170,6 +170,13 @@ def test_blocks_may_be_as_long_as_the_models_window(duet: Scene):
     assert made.frames == 88
 
 
+def test_given_frames_that_are_not_valid_are_warned_of(model: Model, duet: Scene):
+    valid = torch.ones(1, 50, dtype=torch.bool)
+    valid[0, 8:10] = valid[0, 40] = False
+    with pytest.warns(UserWarning, match="2 given frames, frame 8 first, are not valid"):
+        model.predict(duet.replace(valid=valid), "joint_future", context=16, frames=8, seed=1)
+
+
 def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
     motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
     assert motion.given is not None and not motion.given[:, 16:, 1].any()

@@ -138,13 +138,15 @@ def main(arguments: Sequence[str]) -> int:
     files, lead = predict_written.in_front(files, scene)
     plan = plan_of_scene(model.denoiser, task.task, scene.agents, context, frames, sampler)
     unmade = ~plan.finished
-    for line in predict_keys.said_of_keys(scene, plan.known, context // TOKEN_FRAMES):
-        print(line)
-    for line in predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade):
+    for line in (
+        *predict_written.said_of_invalid(scene, plan.known, lead),
+        *predict_keys.said_of_keys(scene, plan.known, context // TOKEN_FRAMES),
+        *predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade),
+    ):
         print(line)
     began = time.perf_counter()
     made = model.predict(
-        Motion.of(scene, body),
+        Motion.of(scene.replace(valid=None), body),  # what is not valid has been said
         task.name,
         context=context,
         frames=frames,

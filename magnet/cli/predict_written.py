@@ -61,6 +61,24 @@ def said_of_unmade(task: str, recorded: Scene, lead: int, frames: int, unmade: T
     return lines
 
 
+def said_of_invalid(scene: Scene, known: Tensor, lead: int) -> list[str]:
+    """A line on given frames that are marked as not valid, from which a model goes on as they are.
+
+    known: (N, P) bool, token steps of people that the task reads.
+    lead: frames of the files before the first frame of `scene`.
+    """
+    from magnet.generation.unmade import given_invalid
+
+    bad = given_invalid(scene, known).nonzero()[:, 0]
+    if not len(bad):
+        return []
+    first, last = lead + int(bad[0]), lead + int(bad[-1])
+    some = f"frame {first}" if len(bad) == 1 else f"{len(bad)} frames from {first} to {last}"
+    verb = "is" if len(bad) == 1 else "are"
+    how = "marked as not valid (not tracked, or made up), and read all the same"
+    return [f"of what is given, {some} {verb} {how}; --start and --end choose others"]
+
+
 def named(people: Sequence[int]) -> str:
     """People in words: person 1, people 0 and 2, or how many."""
     if len(people) > NAMED:

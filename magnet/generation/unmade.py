@@ -1,4 +1,4 @@
-"""People whom a task neither reads nor makes: a scene shows them as recorded, where there is a recording."""
+"""Recorded frames that a task neither reads nor makes, and such as it reads and should not."""
 
 from __future__ import annotations
 
@@ -50,3 +50,12 @@ def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Sc
 def by_frame(unmade: Tensor, made: Scene) -> Tensor:
     """Token steps as frames of a scene. (N, P) bool -> (1, T, P)"""
     return unmade.repeat_interleave(TOKEN_FRAMES, dim=0)[None, : made.frames]
+
+
+def given_invalid(scene: Scene, known: Tensor) -> Tensor:
+    """In which frames something is given that is marked as not valid: not tracked, or made up. known (N, P) -> (T,)"""
+    frames = min(scene.frames, known.shape[0] * TOKEN_FRAMES)
+    if scene.valid is None:
+        return torch.zeros(frames, dtype=torch.bool)
+    read = known.repeat_interleave(TOKEN_FRAMES, dim=0)[:frames] & scene.present.any(dim=0)
+    return (~scene.valid[:, :frames]).any(dim=0) & read.any(dim=1)

@@ -112,6 +112,17 @@ def test_whom_a_task_leaves_out_is_as_recorded_or_said_to_stand_still(case: str,
     assert made.given[0].sum(dim=0).tolist() == [context, context + frames], "pictures show it as not made"
 
 
+def test_given_frames_that_are_not_valid_are_said(duet, tmp_path, capsys) -> None:
+    recorded = Scene.load(duet["ours"][0])
+    valid = torch.ones(recorded.scenes, recorded.frames, dtype=torch.bool)
+    valid[:, 36:38] = False
+    file = str(recorded.replace(valid=valid).save(tmp_path / "gaps.npz"))
+    words = ("--context", "40", "--frames", "8", "--out", str(tmp_path / "o.npz"))
+    text = said(capsys, file, *words, *QUICK)
+    assert "of what is given, 2 frames from 36 to 37 are marked as not valid" in text
+    assert "not valid" not in said(capsys, *duet["ours"], *words, *QUICK)
+
+
 def test_a_recording_that_is_put_in_afterwards_changes_nothing_that_is_made(duet, tmp_path, capsys) -> None:
     recorded = Scene.load(duet["ours"][0])
     other = recorded.T_world_root.clone()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from magnet.generation.unmade import completed
+from magnet.generation.unmade import completed, given_invalid
 from magnet.testing import random_scene
 
 
@@ -23,3 +23,13 @@ def test_whoever_is_left_out_holds_the_last_frame_that_is_sound() -> None:
     assert torch.equal(scene.T_world_root[1, 21:, 2], files.T_world_root[0, 21:, 2])
     assert torch.equal(scene.T_world_root[:, 3:, :2], made.T_world_root[:, :, :2]), "who was made stays"
     assert scene.given[:, 3:].sum(dim=1).tolist() == [[0, 0, 16]] * 2
+
+
+def test_given_frames_that_are_not_valid_are_found_and_others_do_not_matter() -> None:
+    scene = random_scene(2, 24, 2, torch.Generator().manual_seed(0))
+    known = torch.zeros(6, 2, dtype=torch.bool)
+    known[:2] = known[4, 1] = True
+    assert not given_invalid(scene, known).any()
+    valid = torch.ones(2, 24, dtype=torch.bool)
+    valid[1, [5, 9, 18]] = False
+    assert given_invalid(scene.replace(valid=valid), known).nonzero()[:, 0].tolist() == [5, 18]
