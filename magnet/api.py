@@ -293,12 +293,29 @@ class Model:
         if bool((bad := given_invalid(plain, plan.known)).any()):
             first = int(bad.nonzero()[0])
             warnings.warn(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid", stacklevel=2)
-        generator = self._generator(seed)
-        how = (context, frames, samples, self.sampler, generator)
-        sample = generate if slots <= self.most_people else generate_crowd
-        sampled = sample(self.denoiser, plain, chosen, *how, cond=cond).to("cpu")
-        shown = sampled.permute_agents(torch.arange(slots))
-        return Motion.of(completed(shown, plain.to("cpu"), ~plan.finished), body)
+        made = self.sample(scene, chosen, context, frames, seed=seed, samples=samples, cond=cond)
+        return Motion.of(completed(made.plain(), plain.to("cpu"), ~plan.finished), body)
+
+    def sample(
+        self,
+        scene: Scene,
+        task: Task,
+        context: int,
+        frames: int,
+        *,
+        seed: int | None = None,
+        samples: int = 1,
+        cond: Tensor | None = None,
+    ) -> Motion:
+        """What the model makes for a task, and nothing else: whoever the task does not make stands still.
+
+        Arguments and errors as of `predict`, which asks the task by name and shows these people as recorded.
+        """
+        plain, body = _with_its_body(scene)
+        how = (context, frames, samples, self.sampler, self._generator(seed))
+        sample = generate if scene.agents <= self.most_people else generate_crowd
+        made = sample(self.denoiser, plain, task, *how, cond=cond).to("cpu")
+        return Motion.of(made.permute_agents(torch.arange(scene.agents)), body)
 
     def _generator(self, seed: int | None) -> torch.Generator:
         generator = torch.Generator(self.denoiser.device)

@@ -162,6 +162,9 @@ def test_whoever_a_task_does_not_make_is_as_recorded_and_then_stands_still(model
     assert torch.equal(made.T_world_root[:, 32:50, 0], duet.T_world_root[:, 32:50, 0])
     assert torch.equal(made.T_world_root[:, 50:, 0], duet.T_world_root[:, 49:, 0].expand(-1, 6, -1, -1))
     assert made.given[:, :, 0].all() and not made.given[:, 32:, 1].any()
+    plain = model.sample(duet, registry.get("partner_prediction")(target=(1,)), 32, 24, seed=0)
+    assert torch.equal(plain.T_world_root[:, :, 1], made.T_world_root[:, :, 1]), "who is made knows nothing of it"
+    assert not plain.given[:, 32:].any()
 
 
 def test_blocks_may_be_as_long_as_the_models_window(duet: Scene):

@@ -145,16 +145,9 @@ def main(arguments: Sequence[str]) -> int:
     ):
         print(line)
     began = time.perf_counter()
-    made = model.predict(
-        Motion.of(scene.replace(valid=None), body),  # what is not valid has been said
-        task.name,
-        context=context,
-        frames=frames,
-        seed=options.seed,
-        samples=options.samples,
-        **task.fields,
-    )
-    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead, unmade)
+    moved = Motion.of(scene, body)
+    made = model.sample(moved, task.task, context, frames, seed=options.seed, samples=options.samples)
+    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead)
     print(f"{task.name}: {count} frames{seen} in {time.perf_counter() - began:.1f} s, seed {options.seed}")
     from magnet.export import formats
     from magnet.generation.unmade import completed

@@ -87,16 +87,11 @@ def named(people: Sequence[int]) -> str:
     return f"person {names[0]}" if len(names) == 1 else f"people {', '.join(names[:-1])} and {names[-1]}"
 
 
-def said_of_given(made: Scene, lead: int = 0, unmade: Tensor | None = None) -> str:
+def said_of_given(made: Scene, lead: int = 0) -> str:
     """How many frames of whom were given, in all scenes, as a part of a sentence; empty where none were.
 
     lead: recorded frames in front of those that were made.
-    unmade: as for `magnet.generation.unmade.completed`; such frames are marked as given, and no model read them.
     """
-    if unmade is not None and made.given is not None:
-        from magnet.generation.unmade import by_frame
-
-        made = made.replace(given=made.given & ~by_frame(unmade, made))
     if made.given is None or not bool(made.given.any()):
         return ""
     there = made.present.any(dim=0).nonzero()[:, 0].tolist()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError
-from magnet.cli.flags import PlainParser
+from magnet.cli.flags import PlainParser, help_topic
 
 if TYPE_CHECKING:
     from magnet.export.drawing import Size
@@ -47,7 +47,7 @@ def require_no_files_meant(arguments: Sequence[str]) -> None:
     Raises:
         CommandError: names the option, and the two ways to say what is meant.
     """
-    names = (argument.partition("=")[0] for argument in arguments)
+    names = () if help_topic(arguments) is not None else (argument.partition("=")[0] for argument in arguments)
     if name := next((name for name in names if name in OF_FILES), None):
         raise CommandError(
             f"{name} goes with files or with people from nothing, and neither is named: magnet predict IN.bvh {name} "

@@ -289,6 +289,7 @@ def test_an_option_of_files_without_files_says_what_to_name(option: str, capsys)
     assert cli.main(["predict", option, "20", "--samples", "2"]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"magnet: error: {option.partition('=')[0]} goes with files") and "--people 2" in said
+    assert cli.main(["predict", option, "20", "--help"]) == 0, "help is never refused"
 
 
 def test_options_of_files_are_those_that_a_data_set_does_not_have() -> None:
