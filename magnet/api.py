@@ -25,7 +25,8 @@ from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.generation.unmade import completed, given_invalid
-from magnet.motion.scene import FPS, Scene, require_rate
+from magnet.motion.required import require_rate
+from magnet.motion.scene import FPS, Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions

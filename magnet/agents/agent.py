@@ -14,8 +14,9 @@ from magnet.agents.message import JOINTS, LONGEST, POSE, TOKEN, Message
 from magnet.agents.rollout import OwnRollout
 from magnet.denoiser.core import DenoiserCore
 from magnet.motion.frames import rigid
+from magnet.motion.required import require_one, require_rate
 from magnet.motion.rotations import from_quat, to_quat
-from magnet.motion.scene import Scene, cat_time, require_one, require_rate
+from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.options import SamplerOptions
 from magnet.seeding import step_generator
 from magnet.tasks.agentic import AgenticAsync, AgenticSync

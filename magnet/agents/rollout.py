@@ -188,7 +188,7 @@ class OwnRollout(Rollout):
             frames = slice(local * TOKEN_FRAMES, stop * TOKEN_FRAMES)
             pairs = pairwise_by_token(to_9d(pairwise(world.T_world_can[:, frames])))
             latents = held.new_zeros(*held.shape[:3], layout.latent)
-            made = self.model.normalizer.normalize(layout.pack(latents, world.placed_deltas(local, stop), pairs))
+            made = self.model.tokens_of(latents, world.placed_deltas(local, stop), pairs)
             made[..., : layout.latent] = held[..., : layout.latent]
             made[0, 0, slot, : layout.latent] = latent.to(made)
             changed = layout.spread(world._ready(local, stop) & world._touched(moved[local:stop])).to(made.device)

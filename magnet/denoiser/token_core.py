@@ -167,6 +167,14 @@ class TokenModelCore(nn.Module):
         latent[scene.present] = people
         return latent.transpose(1, 2)
 
+    def parts_of(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What normalized tokens (..., P, D) say, in real units, as `TokenLayout.unpack`: latent, deltas, pairs."""
+        return self.layout.unpack(self.normalizer.denormalize(tokens))
+
+    def tokens_of(self, latent: Tensor, deltas: Tensor, pairs: Tensor) -> Tensor:
+        """The normalized tokens that say it; the inverse of `parts_of`. -> (..., P, D)"""
+        return self.normalizer.normalize(self.layout.pack(latent, deltas, pairs))
+
     def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
         scene = scene.pad_agents(self.layout.agents)

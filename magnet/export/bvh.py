@@ -14,7 +14,8 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.joints import HEAD, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
 from magnet.export.bones import Names, bone_names
-from magnet.motion.scene import Scene, require_body, require_one
+from magnet.motion.required import require_body, require_one
+from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm"]
 PER_METRE: dict[str, float] = {"m": 1.0, "cm": 100.0}

@@ -17,8 +17,9 @@ from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.motion.frames import canonical_frame, inverse
+from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import to_quat
-from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
+from magnet.motion.scene import BODY_JOINTS, Scene
 from magnet.version import __version__
 
 FLOAT, BYTE, SHORT, INT = 5126, 5121, 5123, 5125

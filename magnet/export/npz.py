@@ -28,8 +28,9 @@ from magnet.export.smpl_keys import (
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
 from magnet.files import load_npz, save_npz
 from magnet.motion.frames import rigid
+from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import from_rotvec, to_rotvec
-from magnet.motion.scene import BODY_JOINTS, Scene, require_body, require_one
+from magnet.motion.scene import BODY_JOINTS, Scene
 
 SMPLX_JOINTS = 55
 
@@ -305,11 +306,11 @@ def _rate(path: Path, file: Mapping[str, np.ndarray], in_fps: float | None) -> f
     key = first_of(RATE, file.keys())
     fps = in_fps if key is None else _number(path, key, file, "frames a second")
     assert fps is not None  # `_require_keys`
-    require_rate(path, fps, in_fps)
+    require_own_rate(path, fps, in_fps)
     return fps
 
 
-def require_rate(path: str | Path, fps: float, in_fps: float | None) -> None:
+def require_own_rate(path: str | Path, fps: float, in_fps: float | None) -> None:
     """Refuse to call the frame rate of a file another than it says.
 
     Raises:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from magnet.body import Body
 from magnet.export.cutting import kept_frames, require_one_clock
-from magnet.export.npz import clear_axes, is_open, read_smplx, require_rate, stance_in, unit_against
+from magnet.export.npz import clear_axes, is_open, read_smplx, require_own_rate, stance_in, unit_against
 from magnet.export.smpl_keys import posed
 from magnet.export.upright import agreed, said, told_against
 from magnet.files import load_npz
@@ -90,7 +90,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
                 f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
             )
         scene = Scene.load(path)
-        require_rate(path, scene.fps, in_fps)
+        require_own_rate(path, scene.fps, in_fps)
         if scene.body != body.id:
             raise ValueError(
                 f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"

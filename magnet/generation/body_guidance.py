@@ -118,7 +118,7 @@ class BodyGuidance:
         deltas, pairs = moved_along(deltas, pairs, T_world_can, shift, low, stop)
         group = model.layout.spread(model.layout.group_levels(torch.where(unseen, self.low + 1, now)))
         changed = (group > 0) & (group <= self.low)
-        return torch.where(changed, model.normalizer.normalize(model.layout.pack(latent, deltas, pairs)), clean)
+        return torch.where(changed, model.tokens_of(latent, deltas, pairs), clean)
 
     def _placed(self, deltas: Tensor, pairs: Tensor, row: int, seen: Tensor, gone: Tensor) -> Tensor:
         """Where everybody would stand in some rows. seen (B, P), gone (P,) bool -> (B, 4 n, P, 4, 4)"""
@@ -132,7 +132,7 @@ class BodyGuidance:
             options.pairwise_weight, present=seen, fixed=known, anchor=seen.int().argmax(dim=1),
         )  # fmt: skip
         frames = slice(row * TOKEN_FRAMES, (row + n) * TOKEN_FRAMES)
-        stands = world.by_frame(world.placed[row : row + n])[..., None, None] & ~gone[:, None, None]
+        stands = world.rows_by_frame(world.placed[row : row + n])[..., None, None] & ~gone[:, None, None]
         return torch.where(stands, world.T_world_can[:, frames], made)
 
     @torch.enable_grad()
@@ -160,7 +160,9 @@ class BodyGuidance:
             given = given.replace(**{name: value.clone() for name, value in given.tensors().items()})
             features = world.model.tokenizer.decode(leaf, given.betas, deltas[:, :, slots].clone())[:, :T]
             made = posed(features, T_world_can, given)
-            real = world.by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])[:, slots]
+            real = world.rows_by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])[
+                :, slots
+            ]
             body_rot = torch.where(real[..., None, None, None], given.body_rot, made.body_rot)
             root = torch.where(real[..., None, None], given.T_world_root, made.T_world_root)
             x, z = place_shift.unbind(-1)

@@ -43,6 +43,7 @@ class World(Protocol):
     finalized: int
     correction: Corrected | None
     uncorrected: Scene | None
+    chunk_correction: Corrected | None
     there: Tensor
     released: int
     decoder: Carried
@@ -50,7 +51,7 @@ class World(Protocol):
     @property
     def settle(self) -> str | None: ...
 
-    def by_frame(self, rows: Tensor) -> Tensor: ...
+    def rows_by_frame(self, rows: Tensor) -> Tensor: ...
 
 
 class Expected:
@@ -136,7 +137,7 @@ def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None
     """
     first, own = world.finalized * TOKEN_FRAMES, (stop - world.finalized) * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
-    new = world.by_frame(world.placed[rows] & ~world.known[rows])
+    new = world.rows_by_frame(world.placed[rows] & ~world.known[rows])
     after = new[-1:] if told is None else new[-1:] & told.to(new.device)
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     seen = 1 + PACE if world.correction is not None else RECALLED
@@ -192,14 +193,14 @@ def decode_bodies(
     model, options = world.model, world.options
     lead = LEAD if first else 0
     low = max(first - bool(first) - receptive_field(model)[0], 0)
-    latent, deltas, _ = model.layout.unpack(model.normalizer.denormalize(tokens[:, low:near]))
+    latent, deltas, _ = model.parts_of(tokens[:, low:near])
     ways = None
     if expected is not None:
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * TOKEN_FRAMES - lead, (stop + more) * TOKEN_FRAMES)
     shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
-    keep = world.by_frame(world.known[first:stop] & options.keep_given)
+    keep = world.rows_by_frame(world.known[first:stop] & options.keep_given)
     there = world.there[~keep[:, world.there].all(dim=0)]  # of whom something is seen that is not given
     features = decoded_frames(world, latent, deltas, shown, low, near - low, there)
     keep, T_world_can = pad(keep, (0, 0, 0, more * TOKEN_FRAMES)), shown_path(world, near, ways, stop + more)[:, frames]
@@ -207,10 +208,10 @@ def decode_bodies(
     if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
         given = cat_time([world.uncorrected, given.slice(lead)])
     if first:  # whoever was not there before does not go on from anywhere
-        keep = torch.cat([world.by_frame(world.placed[first - 1 : first])[:lead], keep])
+        keep = torch.cat([world.rows_by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
-    placed = world.by_frame(world.placed[first:stop])
+    placed = world.rows_by_frame(world.placed[first:stop])
     there = torch.cat([placed, placed[-1:].expand(more * TOKEN_FRAMES, -1)])
     require_finite(made, there)
     return freeze_after(made, there, before)
@@ -223,7 +224,7 @@ def shown_path(world: World, near: int, ways: Tensor | None, stop: int) -> Tenso
     """
     frames = max(near, stop) * TOKEN_FRAMES
     T_world_can = world.T_world_can[:, : near * TOKEN_FRAMES]
-    placed, known = (world.by_frame(each[:near]) for each in (world.placed, world.known))
+    placed, known = (world.rows_by_frame(each[:near]) for each in (world.placed, world.known))
     if ways is not None:
         steps = from_9d(ways.transpose(2, 3).flatten(1, 2)[:, : frames + 1 - len(placed)])  # (B, f, P, 4, 4)
         for step in steps.unbind(dim=1):
@@ -264,7 +265,7 @@ def continuation(
     """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
     tokens, told = expected
     told = told.to(latent.device)
-    later, ways, _ = world.model.layout.unpack(world.model.normalizer.denormalize(tokens))
+    later, ways, _ = world.model.parts_of(tokens)
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])
     return later, torch.where(told[:, None, None], ways, deltas[:, -1:])

@@ -196,7 +196,7 @@ def known_tokens(
     else:
         T_world_can = canonical_frame(related.T_world_root[:, wanted * TOKEN_FRAMES : end * TOKEN_FRAMES])
     pairs = pairwise_by_token(to_9d(pairwise(T_world_can, model.layout.partners(like.device))))
-    return model.normalizer.normalize(model.layout.pack(latent[:, rows], deltas[:, rows], pairs))
+    return model.tokens_of(latent[:, rows], deltas[:, rows], pairs)
 
 
 def encodings(

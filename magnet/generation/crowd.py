@@ -223,8 +223,8 @@ class CrowdRollout(Rollout):
         """Where people stand from the window on: as placed, else by the deltas predicted last. -> (4 n, P, 4, 4)"""
         T_world_can = self.world.T_world_can[0, start * TOKEN_FRAMES :].clone()
         guess = self._guessed(stage.active[0], self.tokens.shape[1] - active)
-        _, deltas, _ = self.viewer.layout.unpack(self.viewer.normalizer.denormalize(guess))
-        placed = self.world.by_frame(self.world.placed[active:])
+        _, deltas, _ = self.viewer.parts_of(guess)
+        placed = self.world.rows_by_frame(self.world.placed[active:])
         ahead = place(project_se2(from_9d(by_frame(deltas[None]))), None, T_world_now[None])[0]
         new = slice((active - start) * TOKEN_FRAMES, None)
         T_world_can[new] = torch.where(placed[..., None, None], T_world_can[new], ahead)
@@ -248,12 +248,12 @@ class CrowdRollout(Rollout):
 
         Alone they would be decoded to bodies whose hands and feet are up to 20 cm from where they are shown in the end.
         """
-        layout, normalizer, tokenizer = self.viewer.layout, self.viewer.normalizer, self.viewer.tokenizer
+        tokenizer = self.viewer.tokenizer
         low, begins = max(first - BEHIND, 0), self.first + stop
-        held = self.model.layout.unpack(normalizer.denormalize(tokens[:, low:first]))[0]
+        held = self.model.parts_of(tokens[:, low:first])[0]
         before = held, self.world.placed_deltas(low, first)
         ahead = self._guessed(begins, max(self._guess_at + len(self._guess) - begins, 0))
-        latent, deltas, _ = layout.unpack(normalizer.denormalize(ahead[None]))
+        latent, deltas, _ = self.viewer.parts_of(ahead[None])
         behind = tokenizer.requantize(latent) if self.viewer.quantized else latent, deltas
 
         def decode(latent: Tensor, betas: Tensor, deltas: Tensor) -> Tensor:
@@ -270,7 +270,7 @@ class CrowdRollout(Rollout):
         new = new & ~self.world.known[rows.stop] if rows.stop < len(self.world.known) else new
         lead = min(SMOOTHED, rows.start * TOKEN_FRAMES)  # frames before, by which everybody walks
         frames = slice(rows.start * TOKEN_FRAMES - lead, rows.stop * TOKEN_FRAMES)
-        may = torch.nn.functional.pad(self.world.by_frame(new), (0, 0, lead, 0)).to(self._present.device)
+        may = torch.nn.functional.pad(self.world.rows_by_frame(new), (0, 0, lead, 0)).to(self._present.device)
         here = self.world.T_world_can[:, frames]
         self.world.T_world_can[:, frames] = room_made(here, may, self._bonds, self._present)
 

@@ -13,7 +13,8 @@ from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import label
 from magnet.generation.misread import misread, steps_of
-from magnet.motion.scene import Scene, require_rate
+from magnet.motion.required import require_rate
+from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 
 ROUNDED = 0.05

@@ -21,7 +21,8 @@ from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
-from magnet.motion.scene import Scene, cat_time, empty_scene, require_one, require_rate
+from magnet.motion.required import require_one, require_rate
+from magnet.motion.scene import Scene, cat_time, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions

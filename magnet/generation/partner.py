@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_request
 from magnet.generation.online import OnlineRollout
-from magnet.motion.scene import Scene, cat_time, require_rate
+from magnet.motion.required import require_rate
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid

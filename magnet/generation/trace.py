@@ -13,7 +13,8 @@ from magnet.export.trace import DenoisingTrace
 from magnet.generation.causal_bodies import own_view
 from magnet.generation.rollout import Rollout
 from magnet.generation.world import WorldState
-from magnet.motion.scene import Scene, cat_time, require_one, require_rate
+from magnet.motion.required import require_one, require_rate
+from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.options import SamplerOptions

@@ -32,7 +32,7 @@ def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Sc
         B * S scenes of lead + T frames.
     """
     recorded = recorded.to_float32().repeat(made.scenes // recorded.scenes)
-    where = by_frame(unmade, made) & made.present[:, None]
+    where = unmade.repeat_interleave(TOKEN_FRAMES, dim=0)[: made.frames] & made.present[:, None]
     if bool(where.any()):
         last = torch.where(sound(recorded), torch.arange(recorded.frames), -1).cummax(dim=1).values  # (B S, T')
         frame = last[:, (lead + torch.arange(made.frames)).clamp(max=recorded.frames - 1)]  # (B S, T)
@@ -45,11 +45,6 @@ def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Sc
         return made
     front = recorded.slice(0, lead)
     return cat_time([front.replace(given=front.present[:, None].expand(-1, lead, -1)), made])
-
-
-def by_frame(unmade: Tensor, made: Scene) -> Tensor:
-    """Token steps as frames of a scene. (N, P) bool -> (1, T, P)"""
-    return unmade.repeat_interleave(TOKEN_FRAMES, dim=0)[None, : made.frames]
 
 
 def given_invalid(scene: Scene, known: Tensor) -> Tensor:

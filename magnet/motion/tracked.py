@@ -12,8 +12,9 @@ from torch import Tensor
 
 from magnet.checks import require_number, require_whole
 from magnet.motion.frames import rigid
+from magnet.motion.required import require_one
 from magnet.motion.resample import slerp, smoothstep
-from magnet.motion.scene import FPS, Scene, cat_time, require_one
+from magnet.motion.scene import FPS, Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 
 PACE = 1.5

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from magnet.motion.frames import canonical_frame, pose_features, posed
-from magnet.motion.scene import Scene, require_rate
+from magnet.motion.required import require_rate
+from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, scene_deltas
 from magnet.tokenizer.quantizer import sum_over_processes
 

@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 
+from magnet.motion.required import require_rate
 from magnet.motion.resample import resampled
 from magnet.motion.rotations import about_y, geodesic
-from magnet.motion.scene import Scene, cat_time, empty_scene, require_rate
+from magnet.motion.scene import Scene, cat_time, empty_scene
 from magnet.motion.tracked import PACE, LiveFrames, bridged
 from magnet.testing import random_scene
 

@@ -1,0 +1,57 @@
+"""Bodies of all plans that are not causal: decoded chunk by chunk, once nothing around a chunk changes any more."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from magnet.generation.blending import crossfade_given, freeze_after, smoothed_path
+from magnet.generation.causal_bodies import World, decoded_frames
+from magnet.generation.conditioning import receptive_field, require_finite
+from magnet.generation.settling import settled_chunk
+from magnet.motion.frames import posed
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES
+
+
+def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Scene | None) -> Scene:
+    """Bodies of token steps [first, stop), given frames blended in at their seams, corrected where asked for.
+
+    `before`: the frame before them, where there is one, which agents that have ended stand still in. Poses depend on
+    neighbouring token steps, through the decoder and the blending of seams.
+    """
+    options, known, model = world.options, world.known, world.model
+    blend = -(-options.blend // TOKEN_FRAMES) if options.keep_given else 0
+    # Only what is given later has a seam before it; the plain network rounds otherwise in another window.
+    later = options.precision == "reference" or bool(known[stop : stop + blend].any())
+    low, high = max(first - blend, 0), min(stop + blend * later, len(known))
+    behind, ahead = receptive_field(model)
+    near = slice(max(low - behind, 0), high + ahead)
+    latent, deltas, _ = model.parts_of(tokens[:, near])
+    frames = slice((low - near.start) * TOKEN_FRAMES, (high - near.start) * TOKEN_FRAMES)
+    features = decoded_frames(world, latent, deltas, frames, near.start, latent.shape[1])
+    given = world.given.slice(low * TOKEN_FRAMES, high * TOKEN_FRAMES)
+    T_world_can = shown_path(world, low, high)
+    made = posed(features, T_world_can, given)
+    if options.keep_given:
+        made = crossfade_given(made, given, T_world_can, world.rows_by_frame(known[low:high]), options.blend)
+    made = made.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
+    placed = world.placed[first:stop]
+    require_finite(made, world.rows_by_frame(placed))
+    if world.settle is not None:
+        goes_on = placed.all(dim=0).to(tokens.device)
+        seen = made.replace(present=made.present & goes_on)  # nobody makes way for whom nothing is known of
+        fixed = world.rows_by_frame(known[first:stop])
+        corrected, world.chunk_correction = settled_chunk(seen, fixed, world.settle, world.chunk_correction)
+        made = corrected.replace(present=made.present)
+    return freeze_after(made, world.rows_by_frame(placed), before)
+
+
+def shown_path(world: World, first: int, stop: int) -> Tensor:
+    """Canonical frames of token steps [first, stop) as they are shown. -> (B, 4 n, P, 4, 4)"""
+    until = stop * TOKEN_FRAMES + 2
+    T_world_can, frames = world.T_world_can[:, :until], slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
+    if world.options.smooth_path:
+        beside = world.known.any(dim=1, keepdim=True) & ~world.known
+        who = (world.rows_by_frame(each)[:until] for each in (world.placed, world.known, beside))
+        T_world_can = smoothed_path(T_world_can, *who)
+    return T_world_can[:, frames]
