@@ -22,7 +22,7 @@ FARTHEST = 0.6
 HALVINGS = 7
 """Bisections of `FARTHEST`, which find the distance to half a centimetre."""
 
-FEW = 8
+FEW_PEOPLE = 8
 """Up to so many people, pairs are treated one by one, each after the moves of the pairs before."""
 
 CROWD_ROUNDS, PAIRS = 4, 64
@@ -31,7 +31,7 @@ CROWD_ROUNDS, PAIRS = 4, 64
 CROWD_SPEED = 1.0
 """Speed in m/s at which people in a crowd make way: strangers collide faster than partners."""
 
-REACH = 2.2
+ARM_REACH = 2.2
 """Metres between pelvises beyond which no arm reaches the other's trunk, head or legs."""
 
 BRIEF = 75
@@ -200,7 +200,7 @@ def kept_apart(
     free = present[:, None].expand(B, T, P).clone()
     if fixed is not None:
         free &= ~fixed.to(joints.device)
-    if P > FEW:
+    if P > FEW_PEOPLE:
         each = [_crowd_apart(*one, keep, begun, fps) for one in zip(joints, present, free, strict=True)]
         return torch.stack(each)
     for _ in range(keep.rounds if P > 2 else 1):
@@ -259,7 +259,7 @@ def _crowd_apart(joints: Tensor, present: Tensor, free: Tensor, keep: Apart, beg
 def near_pairs(moved: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs whose pelvises come near enough for bodies to touch. moved (P, T, 22, 3) -> (E,) int x 2"""
     ground = moved[:, :, PELVIS, [0, 2]].transpose(0, 1)  # (T, P, 2)
-    near = (torch.cdist(ground, ground) < REACH).any(dim=0) & present[:, None] & present
+    near = (torch.cdist(ground, ground) < ARM_REACH).any(dim=0) & present[:, None] & present
     i, j = near.triu(1).nonzero(as_tuple=True)
     return i, j
 

@@ -30,7 +30,7 @@ DEEP = 0.10
 WITHIN = 0.20
 """Metres between the middles of two hands under which they are in contact."""
 
-REACH = 2.2
+TOUCH_REACH = 2.2
 """Metres between pelvises beyond which no two people touch, nearly: with both arms stretched out."""
 
 STANDING = (0.05, 0.05)
@@ -170,7 +170,7 @@ def _near(scene: Scene, body: Body) -> tuple[Tensor, tuple[Tensor, ...]]:
     joints = body.joints(scene)
     first, second = pairs_of(scene.agents, joints.device)
     pelvis = joints[..., 0, :]
-    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < REACH
+    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < TOUCH_REACH
     both = (scene.present[:, first] & scene.present[:, second])[:, None]
     b, t, pair = (near & both).nonzero(as_tuple=True)
     return joints, (b, t, first[pair], second[pair])

@@ -15,14 +15,14 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 
 SKIN = 0.03
 """Metres between the floor that somebody lies on and a joint that is not of the feet."""
-LOW = 0.05
+STANDING_QUANTILE = 0.05
 """The standing height is this quantile over frames: jumps count little, glitches not at all."""
 OFF = 0.25
 """Metres off the floor at which it cannot be right. In CMU's takes with a right floor, half a second of motion gives up
 to 0.15 m, also where somebody dips a foot into it."""
 JUMP, JUMPED = 16, 0.9
 """In fewer frames somebody may be in the air all the time, up to so many metres; in CMU up to 0.78."""
-NEAR = 0.05
+OTHER_FLOOR = 0.05
 """Metres off the floor of the others at which somebody is told of."""
 MOMENTS = 32
 """Evenly spaced frames that are examined."""
@@ -47,7 +47,7 @@ def standing(lowest: Tensor, counts: Tensor) -> Tensor:
 
     lowest (B, T, P), counts (B, T, P) bool: frames to examine -> (B, P) metres, NaN without any
     """
-    return torch.where(counts, lowest, torch.nan).nanquantile(LOW, dim=1)
+    return torch.where(counts, lowest, torch.nan).nanquantile(STANDING_QUANTILE, dim=1)
 
 
 def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> Tensor:
@@ -106,7 +106,7 @@ def off_their_floor(heights: Sequence[float], names: Sequence[str] = ()) -> list
     return [
         f"{names[p] if names else f'person {p}'}: stands {100 * abs(m):.0f} cm {'over' if m > 0 else 'under'} {said}"
         for p, m in enumerate(heights)
-        if abs(m) > NEAR
+        if abs(m) > OTHER_FLOOR
     ]
 
 

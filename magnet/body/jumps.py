@@ -14,7 +14,7 @@ JUMP = 0.04
 """Metres that a body must move up or down beyond what is usual around that frame, for a jump. In CMU's 72 takes at 30
 frames a second no pelvis moves so by more than 0.02 m."""
 
-AROUND = 2
+USUAL_STEPS = 2
 """Steps before and after whose median is what is usual; at the ends, as many of the clip's first or last."""
 
 
@@ -25,7 +25,7 @@ def jumps(heights: Tensor, fps: float) -> Tensor:
     """
     steps = heights.diff(dim=1)
     each = steps.flatten(2)
-    usual = each.unfold(1, min(2 * AROUND + 1, each.shape[1]), 1).median(dim=-1).values
+    usual = each.unfold(1, min(2 * USUAL_STEPS + 1, each.shape[1]), 1).median(dim=-1).values
     short = each.shape[1] - usual.shape[1]  # padding the steps themselves would make the first one usual
     usual = F.pad(usual.transpose(1, 2), (short // 2, short - short // 2), mode="replicate").transpose(1, 2)
     beyond = steps - usual.unflatten(2, steps.shape[2:])

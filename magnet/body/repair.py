@@ -23,7 +23,7 @@ from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
 from magnet.motion.scene import FPS, Scene, cat_time, concatenate
 
-DEEP: dict[str, Apart] = {
+TOO_DEEP: dict[str, Apart] = {
     name: replace(each, body=each.body + 0.03, arms=each.arms + 0.04) for name, each in APART.items()
 }
 """Depths beyond which whole people are first moved apart; poses do the rest."""
@@ -218,7 +218,7 @@ def _settling(
     last: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
-    toward = kept_apart(body.joints(held), scene.present, fixed, DEEP[FIRM.get(how, how)], begun, scene.fps)
+    toward = kept_apart(body.joints(held), scene.present, fixed, TOO_DEEP[FIRM.get(how, how)], begun, scene.fps)
     settle = settle or Settle()
     wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last, takes=settle.takes)
     first, second = pairs_of(scene.agents, scene.device)

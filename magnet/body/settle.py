@@ -43,7 +43,7 @@ LEAD = 2
 RAMP = 6
 """Frames after a fixed past over which weights grow to their full value."""
 
-FEW = 32
+SOLVED_AT_ONCE = 32
 """Poses of a scene that may move, up to which a step is solved at once, and not by conjugate gradients."""
 
 SMALL = 0.002
@@ -177,7 +177,9 @@ def correct_window(
     offset = offset + smooth.start
     rest = body.rest_joints(scene.betas[:, None])
     capsules = with_measured(fit_capsules(body, scene.betas), rest)
-    few = (free.flatten(1).sum(dim=1) <= FEW)[:, None, None, None]  # scene by scene: no scene depends on the others
+    few = (free.flatten(1).sum(dim=1) <= SOLVED_AT_ONCE)[
+        :, None, None, None
+    ]  # scene by scene: no scene depends on the others
     at_once, one_by_one = bool(few.any()), not bool(few.all())
     done = torch.zeros_like(few)
     goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard)

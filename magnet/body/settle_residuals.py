@@ -19,7 +19,7 @@ from magnet.body.settle_goals import BONES, WEIGHTS, Goals
 NEAR = 0.03
 """Metres short of counting at which capsules are kept: a step may make them count."""
 
-REACH = 1.6
+BODY_REACH = 1.6
 """Metres between pelvises beyond which bodies cannot touch, even with arms half stretched out."""
 
 
@@ -130,7 +130,7 @@ def touching(seen: Seen, capsules: FittedCapsules, goals: Goals, contact: Contac
     T, P = seen.by_frame.shape[1:3]
     first, second = pairs_of(P, seen.joints.device)
     pelvis = seen.by_frame[..., 0, :]
-    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < REACH
+    near = (pelvis[:, :, first] - pelvis[:, :, second]).norm(dim=-1) < BODY_REACH
     b, t, pair = (near & goals.both).nonzero(as_tuple=True)
     count = len(b)
     b, t, p, q = (

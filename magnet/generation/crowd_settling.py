@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magnet.body.apart import APART, REACH, excess_depth, near_pairs
+from magnet.body.apart import APART, ARM_REACH, excess_depth, near_pairs
 from magnet.body.repair import repaired
 from magnet.generation.separation import open_body_on
 from magnet.generation.settling import FINISHED, LEAD, Corrected, settled_chunk
@@ -111,7 +111,7 @@ def deep_moments(joints: Tensor, present: Tensor) -> list[Encounter]:
     people, found = joints.transpose(0, 1), []
     for one, other in zip(*(each.tolist() for each in near_pairs(people, present)), strict=True):
         ground = (people[one, :, 0] - people[other, :, 0])[:, [0, 2]]
-        near = (ground.norm(dim=-1) < REACH / 2).nonzero()[:, 0]
+        near = (ground.norm(dim=-1) < ARM_REACH / 2).nonzero()[:, 0]
         deep = near[excess_depth(people[one, near], people[other, near], APART["light"]) > 0]
         inside = torch.zeros(len(joints), dtype=torch.bool)
         for frame in deep.tolist():
@@ -128,7 +128,7 @@ def _settle(scene: Scene, moment: Encounter, ground: Tensor) -> None:
     away = torch.cdist(ground[start:stop, two], ground[start:stop]).amin(dim=(0, 1))
     away[two] = torch.inf
     beside = away.argsort()[:BESIDE]
-    part = scene.slice(start, stop).permute_agents(torch.cat([two, beside[away[beside] < REACH]]))
+    part = scene.slice(start, stop).permute_agents(torch.cat([two, beside[away[beside] < ARM_REACH]]))
     fixed = torch.zeros_like(part.T_world_root[0, ..., 0, 0], dtype=torch.bool) if part.given is None else part.given[0]
     fixed = fixed.clone()
     fixed[:, 2:] = True

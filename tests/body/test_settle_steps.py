@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.bench.speed import standing
 from magnet.body import load_body
 from magnet.body.repair import settling
-from magnet.body.settle import DOFS, FEW
+from magnet.body.settle import DOFS, SOLVED_AT_ONCE
 from magnet.body.settle_residuals import Residuals
 from magnet.body.settle_steps import TOGETHER, Settle, Smoothness, alike, exact_step, solve, stiffness
 from magnet.generation.settling import SHOWN
@@ -141,7 +141,7 @@ def test_somebody_who_stands_still_is_corrected_however_much_it_weighs() -> None
 
 def test_few_poses_are_solved_at_once_and_a_scene_s_correction_is_its_own() -> None:
     """Also beside one in which more people may move, and beside one that is done with."""
-    scene = standing_scene(frames=FEW // 2 + 2)
+    scene = standing_scene(frames=SOLVED_AT_ONCE // 2 + 2)
     root = scene.T_world_root.clone()
     root[..., 1, 0, 3] = root[..., 0, 0, 3] + 0.15
     deep = scene.replace(T_world_root=root)
