@@ -192,13 +192,19 @@ WIDTH, HEIGHT, LEFT, GAP = 900, 120, 70, 42
 
 
 def curves(scene: Scene, body: Body) -> dict[str, Tensor]:
-    """What is marked on bodies, in each frame of the first scene that somebody is in: by title, (T,)."""
+    """What is marked on bodies, in each frame of the first scene that somebody is in: by title, (T,).
+
+    Of frames that are not valid, and of the step out of them, it is not a number.
+    """
     import torch
 
     from magnet.body.contact import deepest, hand_distance, toe_steps
     from magnet.body.joints import FEET
 
-    one = scene.select([int(scene.present.any(dim=1).int().argmax())])
+    somebody = scene.present.any(dim=1)
+    if scene.valid is not None:
+        somebody &= scene.valid.any(dim=1)
+    one = scene.select([int(somebody.int().argmax())])
     joints = body.joints(one)[0][:, one.present[0]]  # (T, P, 22, 3)
     depth, hands = joints.new_zeros(len(joints)), joints.new_zeros(len(joints))
     for i, j in combinations(range(joints.shape[1]), 2):
@@ -207,23 +213,30 @@ def curves(scene: Scene, body: Body) -> dict[str, Tensor]:
     speed, stands = toe_steps(joints[None], scene.fps)
     slides = torch.where(stands[0], speed[0], 0.0).flatten(1).amax(dim=1)
     lowest = joints[..., FEET, 1].amin(dim=-1)
-    return {
+    counts = joints.new_ones(len(joints), dtype=torch.bool) if one.valid is None else one.valid[0]
+    made = {
         "depth between people, cm": 100 * depth,
         "fastest standing toe, m/s": torch.nn.functional.pad(slides, (1, 0)),
         "highest lower foot, cm": 100 * lowest.amax(dim=1),
         "deepest foot in the floor, cm": 100 * (-lowest.amin(dim=1)).clamp_min(0),
         "people hand in hand, pairs": hands,
     }
+    moves = torch.cat([counts[:1], counts[1:] & counts[:-1]])
+    return {title: torch.where(moves if "m/s" in title else counts, of, torch.nan) for title, of in made.items()}
 
 
 def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float) -> str:
-    """The picture as SVG: one strip for each title, before in red and after in green."""
+    """The picture as SVG: one strip for each title, before in red and after in green; gaps where nothing counts."""
+    import torch
+
     from magnet.export.page.palette import COLLIDES, STANDS, hexed
+    from magnet.motion.runs import true_runs
 
     parts = []
     for row, title in enumerate(before):
         top = GAP + row * (HEIGHT + GAP)
-        most = max(float(before[title].max()), float(after[title].max())) or 1.0  # of nothing at all, a line at 0
+        values = torch.cat([before[title], after[title]])
+        most = float(values[values.isfinite()].max()) or 1.0  # of nothing at all, a line at 0
         parts.append(f'<text x="{LEFT}" y="{top - 8}">{title}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + 10}" text-anchor="end">{most:.3g}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + HEIGHT}" text-anchor="end">0</text>')
@@ -231,8 +244,9 @@ def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float)
         for name, values in (("before", before[title]), ("after", after[title])):
             across = (WIDTH - LEFT - 10) / max(len(values) - 1, 1)
             heights = (top + HEIGHT - HEIGHT * values.clamp(0, most) / most).tolist()
-            points = " ".join(f"{LEFT + across * t:.1f},{y:.1f}" for t, y in enumerate(heights))
-            parts.append(f'<polyline points="{points}" class="{name}"/>')
+            points = [f"{LEFT + across * t:.1f},{y:.1f}" for t, y in enumerate(heights)]
+            for start, stop in true_runs(values.isfinite().numpy()):
+                parts.append(f'<polyline points="{" ".join(points[start:stop])}" class="{name}"/>')
     bottom = GAP + len(before) * (HEIGHT + GAP)
     seconds = len(next(iter(before.values()))) / fps
     parts.append(f'<text x="{LEFT}" y="{bottom - 16}">0 to {seconds:.1f} s; red: before, green: after</text>')

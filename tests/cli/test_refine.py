@@ -11,7 +11,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.body.contact import depth_between, overlaps
-from magnet.cli.refine import told
+from magnet.cli.refine import curves, drawn, told
 from magnet.motion.scene import Scene, concatenate, empty_scene
 from magnet.synthesis import synthesize
 
@@ -145,6 +145,23 @@ def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene
     assert all(len(points.split()) == 40 for points, _ in lines)
     heights = [float(point.partition(",")[2]) for point in lines[0][0].split()]
     assert min(heights) < 0.5 * (42 + 162), "the deepest reaches the top of its strip"
+
+
+def test_the_picture_leaves_out_frames_that_are_not_valid(crowded: Scene) -> None:
+    scene = crowded.slice(0, 20)
+    away = scene.T_world_root.clone()
+    away[:, 8:12, 0, 0, 3] += 50.0
+    valid = torch.ones(1, 20, dtype=torch.bool)
+    valid[:, 8:12] = False
+    made = curves(scene.replace(T_world_root=away, valid=valid), load_body())
+    plain = curves(scene, load_body())
+    for title, values in made.items():
+        left_out = slice(8, 13) if "m/s" in title else slice(8, 12)
+        assert values[left_out].isnan().all()
+        assert torch.equal(values.isnan().sum(), torch.tensor(left_out.stop - left_out.start))
+        assert torch.allclose(values[14:], plain[title][14:])
+    lines = re.findall(r'<polyline points="([^"]*)" class="before"', drawn(made, made, 30.0))
+    assert [len(points.split()) for points in lines[:4]] == [8, 8, 8, 7]
 
 
 def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
