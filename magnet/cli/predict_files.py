@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import itertools
 import time
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli import predict_keys, predict_written, scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import taken_out
+from magnet.cli.predict_lengths import CONTEXT, FUTURE, lengths
 
 if TYPE_CHECKING:
     from magnet.api import Model
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from magnet.motion.scene import Scene
     from magnet.sampling.options import SamplerOptions
 
-CONTEXT = 32
-"""Frames given of everybody where nothing is said and the task reads what comes later, as in its tests: a second."""
-FUTURE = 150
-"""Frames that are sampled where nothing is said and nothing recorded is read: five seconds."""
 HELP = "magnet predict --help files"
 READ = (".npz", ".bvh")
 """`magnet.export.formats.READ`, which would import torch."""
@@ -79,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
     add("--task.FIELD", metavar="VALUE", help="an option of the task")
     add("--people", type=int, metavar="P", help="people in all, up to 200; those without a file are generated")
     add("--spacing", type=float, metavar="M", help="metres between the groups of a crowd (default: 3)")
-    given = f"all of IN where the task only goes on from it, else {CONTEXT}, or 0 as needed"
+    given = f"all of IN where the task only goes on from it, else {CONTEXT}, or fewer as needed"
     add("--context", type=int, metavar="T", help=f"frames given of everybody at the start (default: {given})")
     frames = f"frames after them (default: to the end of IN where the task reads it, else {FUTURE})"
     add("--frames", type=int, metavar="T", help=frames)
@@ -304,81 +300,3 @@ def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
     for key, value in options.items():
         found |= flat(value, f"{within}{key}.") if isinstance(value, dict) else {f"{within}{key}": value}
     return found
-
-
-def lengths(
-    options: argparse.Namespace, choice: TaskChoice, scene: Scene, added: tuple[int, ...], model: Model
-) -> tuple[Scene, int, int]:
-    """What is read of the files, its frames that are given of everybody, and frames after them.
-
-    A task that reads nothing of the recording after its context goes on from the end, so that nothing is thrown away.
-
-    Raises:
-        CommandError: the task reads motion that was not recorded.
-        ValueError: the task makes no sense at these sizes.
-    """
-    from magnet.generation.plan import plan_of_scene
-    from magnet.motion.tokens import TOKEN_FRAMES
-
-    crowd = scene.agents > model.most_people and choice.name != "generation"
-    nothing = bool(added) or not (options.inputs or crowd)
-    recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
-    context = context_of(options, scene.frames, recorded, nothing)
-    rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
-    planned = functools.partial(plan_of_scene, model.denoiser, choice.task, scene.agents, options=model.sampler)
-    if added:  # planned with a past, for tasks that need one refuse to be planned without
-        longer = planned(max(context, TOKEN_FRAMES), rest + min(context, TOKEN_FRAMES))
-        if bool(longer.known[:, list(added)].any()):
-            raise CommandError(
-                f"{choice.name} reads motion of person {added[0]}, of whom no file tells; partner_inpainting adds "
-                "people to those that are there, generation makes everybody"
-            )
-    known = planned(context, rest).known
-    if bool(known[context // TOKEN_FRAMES :].any()):
-        return scene, context, rest if options.frames or recorded > context else FUTURE
-    if bool(known.any()):
-        scene, context = going_on(options, choice.name, scene, context, recorded)
-    else:  # as of generation, to which a context would be frames of nothing
-        context = 0
-        if options.inputs:
-            print(f"{choice.name} is given no motion: of the files only the number and shapes of people are read")
-    return scene, context, options.frames or FUTURE
-
-
-def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing: bool) -> int:
-    """Frames that are given of everybody, in whole tokens, where the task reads what comes after them.
-
-    Args:
-        frames: of the files.
-        recorded: of these, in whole tokens.
-        nothing: what is not said is 0: somebody is made from nothing.
-
-    Raises:
-        CommandError: more than there is, or less than a token.
-    """
-    from magnet.motion.scene import FPS
-    from magnet.motion.tokens import TOKEN_FRAMES
-
-    if options.inputs and not recorded:
-        raise CommandError(f"the files hold {frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
-    context: int | None = options.context
-    if context is None:
-        return 0 if nothing else min(CONTEXT, recorded)
-    if 0 < context < TOKEN_FRAMES:
-        raise CommandError(f"--context {context}: a token is {TOKEN_FRAMES} frames; give as many or more, or 0")
-    whole = context // TOKEN_FRAMES * TOKEN_FRAMES
-    if whole > recorded or context > frames:
-        raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
-    if whole < context:
-        print(f"--context {context}: {whole} are given, for a token is {TOKEN_FRAMES} frames")
-    return whole
-
-
-def going_on(options: argparse.Namespace, task: str, scene: Scene, context: int, recorded: int) -> tuple[Scene, int]:
-    """What a task goes on from that reads nothing after its context: all of the files, unless --context says less."""
-    if options.context is None and recorded:
-        return scene.slice(scene.frames - recorded), recorded
-    if scene.frames > context and options.inputs:
-        unread = f"{scene.frames - context} of {scene.frames} recorded frames come after it and are not read"
-        print(f"--context {context}: {unread}; without it {task} goes on from the end")
-    return scene, context
