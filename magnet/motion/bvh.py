@@ -49,8 +49,7 @@ def bvh_header(lines: Sequence[str], path: object) -> BvhHeader:
     Raises:
         ValueError: no BVH, cut short, or a line that makes no sense; names file and line.
     """
-    if not _begins(lines):
-        raise ValueError(f"{path}: {STRANGE}")
+    _first(path, lines)
     begin = next((i for i, line in enumerate(lines) if line.strip().upper() == "MOTION"), None)
     if begin is None:
         raise ValueError(f"{path}: has no MOTION part; the file may be truncated: export it again")
@@ -122,10 +121,9 @@ def parse_hierarchy(path: object, lines: Sequence[str]) -> list[BvhJoint]:
     Raises:
         ValueError: no BVH, incomplete, or a line that makes no sense; names file and line.
     """
-    if not _begins(lines):
-        raise ValueError(f"{path}: {STRANGE}")
+    first = _first(path, lines) + 1
     reading = _Hierarchy()
-    for number, line in enumerate(lines[1:], start=2):
+    for number, line in enumerate(lines[first:], start=first + 1):
         for words in _statements(line):
             reading.take(f"{path}:{number}", words)
     whole = reading.joints and all(math.isfinite(joint.offset[0]) or joint.end for joint in reading.joints)
@@ -134,8 +132,12 @@ def parse_hierarchy(path: object, lines: Sequence[str]) -> list[BvhJoint]:
     return reading.joints
 
 
-def _begins(lines: Sequence[str]) -> bool:
-    return bool(lines) and lines[0].strip().upper().endswith("HIERARCHY")  # a byte-order mark may come first
+def _first(path: object, lines: Sequence[str]) -> int:
+    """The line of HIERARCHY, from 0; blank lines may come before it, and a byte-order mark."""
+    at = next((i for i, line in enumerate(lines) if line.strip("\ufeff \t\r\n")), 0)
+    if not lines or not lines[at].strip().upper().endswith("HIERARCHY"):
+        raise ValueError(f"{path}: {STRANGE}")
+    return at
 
 
 def _statements(line: str) -> list[list[str]]:

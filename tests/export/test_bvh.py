@@ -170,6 +170,16 @@ BREAKS = {
 }  # fmt: skip
 
 
+def test_blank_lines_may_come_before_the_hierarchy(trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    plain, text = read_bvh(path), path.read_text()
+    path.write_text("\ufeff\n \n" + text, encoding="utf-8")
+    assert np.array_equal(read_bvh(path).world()[1], plain.world()[1])
+    path.write_text("\n\n" + text.replace("CHANNELS 6 Xposition", "CHANNELS 6 X", 1))
+    with pytest.raises(ValueError, match=r":7: CHANNELS 6 X .*: expected 6 of"):
+        read_bvh(path)
+
+
 @pytest.mark.parametrize("message", BREAKS)
 def test_a_broken_file_is_named_with_what_is_wrong(message, trio: Scene, body: Body, tmp_path: Path):
     path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
