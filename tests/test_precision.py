@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from pathlib import Path
 
 import lightning as L
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
+import magnet
+from magnet.api import Model
 from magnet.body import load_body
 from magnet.denoiser.module import Denoiser
+from magnet.export import save_bvh
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.precision import Float32, quick_precision
@@ -114,3 +119,35 @@ def test_what_else_was_asked_for_stays(
 ) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
     assert quick_precision(precision, accelerator) == precision
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def made_by(model: Model, duet: Scene, bvh: list[Path]) -> list[Scene]:
+    read = magnet.read(*bvh).plain()
+    answer = model.partner(duet.slice(0, 16), seed=0).answer(duet.slice(16, 24))
+    return [
+        read,
+        model.generate(2, 12, seed=0).plain(),
+        model.generate(4, 8, seed=0).plain(),
+        model.continue_(duet.slice(0, 16), 8, seed=0).plain(),
+        answer.plain(),
+    ]
+
+
+def test_another_default_dtype_of_torch_changes_nothing(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    model = Model(tiny_denoiser(max_agents=3), SamplerOptions(steps=2, settle="hold"))
+    duet = random_scene(1, 24, 2, torch.Generator().manual_seed(5))
+    bvh = save_bvh(duet, tmp_path / "a.bvh", load_body())
+    before = made_by(model, duet, bvh)
+    request.getfixturevalue("double")
+    loaded = magnet.load("duet", steps=1).denoiser
+    assert {p.dtype for p in (*loaded.parameters(), *loaded.buffers()) if p.is_floating_point()} == {torch.float32}
+    for was, now in zip(before, made_by(model, duet, bvh), strict=True):
+        for name, value in now.tensors().items():
+            assert value.dtype == getattr(was, name).dtype and torch.equal(value, getattr(was, name)), name

@@ -73,7 +73,7 @@ def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
     c, d, _ = capsule_segments(other)
     first, second = nearest_points(a[..., :, None, :], b[..., :, None, :], c[..., None, :, :], d[..., None, :, :])
     arm = torch.tensor(ARMS, device=one.device)
-    allowed = torch.where(arm[:, None] | arm, keep.arms, keep.body)
+    allowed = torch.where(arm[:, None] | arm, keep.arms, keep.body).to(one)
     depth = radius[:, None] + radius - (first - second).norm(dim=-1) - allowed
     return torch.where(arm[:, None] & arm, -torch.inf, depth).amax(dim=(-1, -2))
 

@@ -53,7 +53,7 @@ def allowed_between(contact: Contact) -> Tensor:
     K = len(PARTS)
     arm, hold = torch.zeros(K, dtype=torch.bool), torch.zeros(K, dtype=torch.bool)
     arm[list(UPPER_ARMS + FOREARMS + HANDS)], hold[list(FOREARMS + HANDS)] = True, True
-    allowed = torch.where(arm[:, None] | arm, contact.arms, contact.body)
+    allowed = torch.where(arm[:, None] | arm, contact.arms, contact.body).float()
     return torch.where(hold[:, None] & hold, torch.inf, allowed)
 
 
@@ -61,7 +61,7 @@ def allowed_between_measured(contact: Contact) -> Tensor:
     """`allowed_between` for capsules of `with_measured`, each kind against its own. -> (K + 13, K + 13) metres"""
     fitted = allowed_between(contact)
     K = len(fitted)
-    allowed = torch.full((K + len(CAPSULES), K + len(CAPSULES)), torch.inf)
+    allowed = torch.full((K + len(CAPSULES), K + len(CAPSULES)), torch.inf, dtype=fitted.dtype)
     allowed[:K, :K], allowed[K:, K:] = fitted, contact.measured
     forearm = torch.tensor([False] * K + [capsule.name.endswith("forearm") for capsule in CAPSULES])
     allowed[forearm[:, None] & forearm] = torch.inf
@@ -71,7 +71,7 @@ def allowed_between_measured(contact: Contact) -> Tensor:
 def allowed_within(contact: Contact) -> Tensor:
     """The same within one body, infinite except in the upper triangle and for neighbours. -> (K, K)"""
     K = len(PARTS)
-    allowed = torch.full((K, K), torch.inf)
+    allowed = torch.full((K, K), torch.inf, dtype=torch.float32)
     free = list(FOREARMS + HANDS)
     for part in free:
         allowed[list(TRUNK + LEGS), part] = contact.own

@@ -131,7 +131,7 @@ def _fit(body: Body, betas: Tensor) -> FittedCapsules:
     owner = body.weights.argmax(dim=1)
     corners = body.v_template[body.faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=-1).norm(dim=-1)
-    weight = torch.zeros(len(owner), device=area.device).index_add_(0, body.faces.flatten(), area.repeat_interleave(3))
+    weight = area.new_zeros(len(owner)).index_add_(0, body.faces.flatten(), area.repeat_interleave(3))
     fitted = [_fitted(part, body, vertices, rest, owner, weight) for part in PARTS]
     ends = torch.stack([each for each, _ in fitted], dim=1).unflatten(0, betas.shape[:2])
     radius = torch.stack([each for _, each in fitted], dim=1).unflatten(0, betas.shape[:2])
@@ -150,7 +150,7 @@ def _fitted(
         mine &= (height >= low + part.low * (high - low)) & (height <= low + part.high * (high - low))
     skin, weight = vertices[:, mine] - rest[:, None, part.bone], weight[mine]
     if across:
-        axis = torch.tensor([1.0, 0.0, 0.0], device=skin.device).expand(len(skin), 3)
+        axis = skin.new_tensor([1.0, 0.0, 0.0]).expand(len(skin), 3)
     else:
         axis = torch.nn.functional.normalize(rest[:, part.axis] - rest[:, part.bone], dim=-1)
     along = (skin * axis[:, None]).sum(dim=-1)

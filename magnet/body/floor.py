@@ -37,7 +37,7 @@ def lowest(scene: Scene, body: Body | None = None) -> Tensor:
     betas = scene.betas.float() if scene.body == body.id else torch.zeros_like(scene.betas, dtype=torch.float32)
     betas = betas.to(body.J_template.device)
     joints = body.forward_kinematics(scene.body_rot.to(betas), scene.T_world_root.to(betas), betas[:, None])
-    above = torch.full((*betas.shape[:2], BODY_JOINTS), SKIN, device=betas.device)
+    above = torch.full((*betas.shape[:2], BODY_JOINTS), SKIN, dtype=betas.dtype, device=betas.device)
     above[..., list(FEET)] = clearance(body, betas.flatten(0, 1)).unflatten(0, betas.shape[:2])
     return (joints[..., 1] - above[:, None]).amin(dim=-1).to(scene.device)
 

@@ -121,7 +121,7 @@ def _bridged(runs: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
 def _eased(hold: Hold, frames: int, fps: float) -> Tensor:
     """How far hands follow a hold, 0 to 1, in each of its frames; the first and last of a motion need no easing."""
     count, length = hold.stop - hold.start, max(EASE * fps, 1.0)
-    into = torch.arange(1, count + 1) / length
-    rise = torch.ones(count) if hold.start == 0 else into
-    fall = torch.ones(count) if hold.stop == frames else into.flip(0)
+    into = torch.arange(1, count + 1, dtype=torch.float32) / length
+    rise = torch.ones_like(into) if hold.start == 0 else into
+    fall = torch.ones_like(into) if hold.stop == frames else into.flip(0)
     return smoothstep(torch.minimum(rise, fall).clamp(0, 1))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from magnet.body.base import Body
@@ -72,4 +71,4 @@ def _legs(body: Body, betas: Tensor) -> Tensor:
     """Length of thigh and shin, of both sides the mean. (..., 10) -> (...) metres"""
     rest = body.rest_joints(betas)
     bones = (rest[..., list(upper), :] - rest[..., list(lower), :] for upper, lower in ((HIPS, KNEES), (KNEES, ANKLES)))
-    return sum((bone.norm(dim=-1).mean(dim=-1) for bone in bones), torch.zeros(()))
+    return sum((bone.norm(dim=-1).mean(dim=-1) for bone in bones), rest.new_zeros(()))

@@ -141,7 +141,7 @@ class TokenModelCore(nn.Module):
         model = cls(**{**stored, **{name: None for name in ("tokenizer", "start_from") if name in fields}})
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
-        return model.eval()
+        return model.float().eval()  # also where torch's default is another dtype
 
     # -- scenes and tokens -----------------------------------------------------------------------
 

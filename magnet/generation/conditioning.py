@@ -167,8 +167,9 @@ def known_tokens(
     N, P = known.shape
     wanted, end, _ = rows.indices(N)
     like = given.T_world_root
-    latent = torch.zeros(given.scenes, N, P, model.layout.latent, device=like.device)
-    deltas = to_9d(torch.eye(4, device=like.device)).expand(given.scenes, N, P, TOKEN_FRAMES, 9).clone()
+    latent = like.new_zeros(given.scenes, N, P, model.layout.latent)
+    still = to_9d(torch.eye(4, dtype=like.dtype, device=like.device))
+    deltas = still.expand(given.scenes, N, P, TOKEN_FRAMES, 9).clone()
     before = max(wanted - 1, 0)  # a row more in front, for the first delta
     T_world_can = canonical_frame(like[:, before * TOKEN_FRAMES : end * TOKEN_FRAMES])
     for start, stop, agents in segments(known):

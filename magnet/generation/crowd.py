@@ -374,7 +374,7 @@ class CrowdRollout(Rollout):
         T_ego_who = from_9d((clean * std + mean).unflatten(-1, (TOKEN_FRAMES, 9)))
         itself = (who == ego)[:, None, None, None]
         return (
-            torch.where(itself, torch.eye(4, device=ego.device), T_ego_who),
+            torch.where(itself, torch.eye(4, dtype=T_ego_who.dtype, device=ego.device), T_ego_who),
             noise,
             torch.where(who == ego, -1, level),
         )

@@ -60,7 +60,7 @@ def start_crowd(
     turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
     if not groups:
         couples = -(-people // 2)
-        empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros(()))
+        empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros((), dtype=torch.float32))
         shapes = shapes_by_chance(2 * couples, turns)
         if betas is not None:
             shapes[:people] = betas.cpu()
@@ -72,7 +72,7 @@ def start_crowd(
 
 def shapes_by_chance(people: int, generator: torch.Generator | None = None) -> Tensor:
     """Shapes of people who differ. (people, 10); generator: on the CPU"""
-    return (SHAPES * torch.randn(people, 10, generator=generator)).clamp(-2, 2)
+    return (SHAPES * torch.randn(people, 10, generator=generator, dtype=torch.float32)).clamp(-2, 2)
 
 
 def crowd_from_nothing(people: int, generator: torch.Generator | None = None) -> Scene:
@@ -84,7 +84,7 @@ def crowd_from_nothing(people: int, generator: torch.Generator | None = None) ->
         ValueError: nobody, or more people than `MOST`.
     """
     require_whole("people", people, 1, MOST)
-    empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros(()))
+    empty = empty_scene(1, TOKEN_FRAMES, people, torch.zeros((), dtype=torch.float32))
     there = torch.ones(1, people, dtype=torch.bool)
     return empty.replace(present=there, betas=shapes_by_chance(people, generator)[None])
 
@@ -144,10 +144,10 @@ def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, sp
     placed = []
     for number, part in enumerate(parts):
         row, column = divmod(number, columns)
-        cell = spacing * torch.tensor([column - (columns - 1) / 2, row - (rows - 1) / 2])
+        cell = spacing * torch.tensor([column - (columns - 1) / 2, row - (rows - 1) / 2], dtype=torch.float32)
         middle = part.T_world_root[0, :, :, [0, 2], 3].mean(dim=(0, 1)).cpu()
-        turn = 2 * math.pi * torch.rand((), generator=generator)
-        T_cell_middle = from_planar(torch.zeros(()), -middle)
+        turn = 2 * math.pi * torch.rand((), generator=generator, dtype=torch.float32)
+        T_cell_middle = from_planar(torch.zeros_like(turn), -middle.float())
         T_floor_cell = from_planar(turn, cell)
         placed.append(part.transformed((T_floor_cell @ T_cell_middle).to(part.T_world_root)))
     return cat_agents(placed)

@@ -39,7 +39,7 @@ def starts(
     anchor = (present * (4 * now.int() + 2 * there.int() + new.int())).argmax(dim=1)
     scene = torch.arange(len(starts), device=starts.device)
     onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
-    onward = torch.where(there[anchor, None, None], onward, torch.eye(4, device=starts.device))
+    onward = torch.where(there[anchor, None, None], onward, torch.eye(4, dtype=starts.dtype, device=starts.device))
     T_world_anchor = torch.where(now[anchor, None, None], T_world_first[scene, anchor], onward)
     for agent in (~there).nonzero()[:, 0].tolist():
         stands = T_world_first[:, agent] if bool(now[agent]) else T_world_anchor

@@ -125,7 +125,7 @@ def _rigid(scene: Scene) -> Tensor:
     x, y, z = rotations.unbind(dim=-1)
     mirrored = (torch.linalg.cross(x, y, dim=-1) - z).flatten(3)
     lengths = torch.cat([x.square().sum(-1), y.square().sum(-1)], dim=-1) - 1
-    below = scene.T_world_root[..., 3, :] - torch.eye(4, device=scene.device)[3]
+    below = scene.T_world_root[..., 3, :] - torch.eye(4, dtype=rotations.dtype, device=scene.device)[3]
     off = torch.cat([mirrored, lengths, (x * y).sum(-1), below], dim=-1)
     return off.abs().amax(dim=-1) < ROUNDED
 

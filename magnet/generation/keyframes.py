@@ -37,7 +37,8 @@ class Goal:
 
     def frame(self) -> Tensor:
         """T_world_can (4, 4)."""
-        return from_planar(torch.tensor(self.heading), torch.tensor([self.x, self.z]))
+        place = torch.tensor([self.x, self.z, self.heading], dtype=torch.float32)
+        return from_planar(place[2], place[:2])
 
 
 @dataclass(frozen=True)

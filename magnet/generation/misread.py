@@ -155,7 +155,7 @@ def _legs(scene: Scene) -> Tensor:
     """From ankles to hips, of a body of average shape, metres. -> (F, P, 3)"""
     body = open_body().to(scene.device)
     joints = body.forward_kinematics(
-        scene.body_rot[0].float(), scene.T_world_root[0].float(), torch.zeros(10).to(scene.device)
+        scene.body_rot[0].float(), scene.T_world_root[0].float(), torch.zeros(10, dtype=torch.float32).to(scene.device)
     )
     return (joints[..., list(HIPS), :] - joints[..., list(ANKLES), :]).mean(dim=-2)
 

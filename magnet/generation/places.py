@@ -181,7 +181,9 @@ class Places:
         key_delta = inverse(T_world_key) @ self.T_world_can[scene, key + 1, lead]
         path = self.T_world_can[scene, :key, lead]
         shift = T_world_key @ inverse(path[:, -1] @ delta_between(path, key_delta))
-        shift = torch.where(there.any(dim=1)[:, None, None], shift, torch.eye(4, device=shift.device))
+        shift = torch.where(
+            there.any(dim=1)[:, None, None], shift, torch.eye(4, dtype=shift.dtype, device=shift.device)
+        )
         placed = self.rows_by_frame(self.placed[: key // TOKEN_FRAMES])[..., None, None]
         now = self.T_world_can[:, :key]
         self.T_world_can[:, :key] = torch.where(placed, project_se2(shift[:, None, None] @ now), now)

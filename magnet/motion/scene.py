@@ -259,8 +259,8 @@ def require_rotations(scene: Scene, name: str) -> None:
     """
     root = scene.T_world_root[..., None, :, :].float()
     turns = torch.cat([root[..., :3, :3], scene.body_rot.float()], dim=3)  # (B, T, P, joints, 3, 3)
-    off = (turns.mT @ turns - torch.eye(3, device=turns.device)).abs().amax(dim=(-2, -1))
-    low = (root[..., 3, :] - torch.eye(4, device=root.device)[3]).abs().amax(dim=-1) > NO_ROTATION
+    off = (turns.mT @ turns - torch.eye(3, dtype=turns.dtype, device=turns.device)).abs().amax(dim=(-2, -1))
+    low = (root[..., 3, :] - torch.eye(4, dtype=root.dtype, device=root.device)[3]).abs().amax(dim=-1) > NO_ROTATION
     wrong = ~(off <= NO_ROTATION) & turns.flatten(4).isfinite().all(dim=-1)  # also of what is too large to be squared
     wrong |= (torch.linalg.cross(turns[..., 0], turns[..., 1]) * turns[..., 2]).sum(-1).lt(0)
     wrong[..., :1] |= low

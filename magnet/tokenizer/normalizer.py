@@ -26,8 +26,8 @@ class Normalizer(Float32):
     def __init__(self, size: int, floor: float = FLOOR) -> None:
         super().__init__()
         self.floor = floor
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("std", torch.ones(size))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float32))
+        self.register_buffer("std", torch.ones(size, dtype=torch.float32))
         self.register_buffer("ready", torch.tensor(False))
 
     def set(self, mean: Tensor, std: Tensor) -> None:

@@ -65,9 +65,9 @@ class ResidualVQ(Float32):
         self._searched: tuple[tuple[int, int], list[Book]] | None = None  # while codes stay
         self._lookups = 0  # of few vectors, since then
         self._started: tuple[tuple[int, int], bool] | None = None  # whether there are codes, while that stays
-        self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim))
-        self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size))
-        self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim))
+        self.register_buffer("codes", torch.zeros(num_quantizers, codebook_size, codebook_dim, dtype=torch.float32))
+        self.register_buffer("ema_count", torch.ones(num_quantizers, codebook_size, dtype=torch.float32))
+        self.register_buffer("ema_sum", torch.zeros(num_quantizers, codebook_size, codebook_dim, dtype=torch.float32))
         self.register_buffer("initialized", torch.tensor(False))
 
     # -- looking up ----------------------------------------------------------------------------
