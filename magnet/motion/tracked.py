@@ -25,6 +25,8 @@ LONGEST = 10.0
 """Seconds from one time to the next, at most: more is another clock or another unit."""
 SLACK = 1e-6
 """Seconds by which a pose may come before the frame that it stands for: clocks round."""
+COARSE = 1e-3
+"""Seconds between a time and the next that float64 can tell from it, at most: more is no time in seconds."""
 
 
 def bridged(last: Scene, coming: Scene, frames: int = 32, since: int = 0) -> Scene:
@@ -115,12 +117,13 @@ class LiveFrames:
             seconds: of any clock that does not go back.
 
         Raises:
-            ValueError: not one frame of one scene, other slots than before, or a time over 10 s from the one before.
+            ValueError: not one frame of one scene, other slots than before, or a time over 10 s from the one before,
+                or one that is not in seconds.
         """
         require_one(pose)
         if pose.frames != 1:
             raise ValueError(f"pose: got {pose.frames} frames, expected 1: add each of several at its own time")
-        require_number("seconds", seconds)
+        _require_seconds(seconds)
         if self._pose is not None and pose.agents != self._pose.agents:
             raise ValueError(f"pose: got {pose.agents} agents, expected {self._pose.agents} as before, in their slots")
         late = self._pose is not None and self._later(seconds) <= 0
@@ -149,6 +152,7 @@ class LiveFrames:
         Raises:
             ValueError: nothing was added before, or a time over 10 s from the one before.
         """
+        _require_seconds(seconds)
         if self._last is None:
             raise ValueError("hold: nothing was added that could be held")
         if self._later(seconds) <= 0:
@@ -191,3 +195,10 @@ class LiveFrames:
         count = len(self._waiting) // TOKEN_FRAMES * TOKEN_FRAMES
         whole, self._waiting = self._waiting[:count], self._waiting[count:]
         return cat_time(whole) if whole else None
+
+
+def _require_seconds(seconds: float) -> None:
+    """Refuse a time so large that frames are lost in its rounding, such as nanoseconds since 1970."""
+    require_number("seconds", seconds)
+    if math.ulp(seconds) > COARSE:
+        raise ValueError(f"seconds: got {seconds:g}, expected seconds, not nanoseconds; take time.monotonic()")

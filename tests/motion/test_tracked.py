@@ -183,3 +183,10 @@ def test_a_bridge_from_nowhere_is_refused(told: str, how) -> None:
 def test_who_has_another_rate_is_told_what_brings_it_there_live() -> None:
     with pytest.raises(ValueError, match=r"resampled\(scene, 30\) or, live, pose by pose, magnet\.export\.LiveFrames$"):
         require_rate(standing(0.0).replace(fps=60.0))
+
+
+def test_a_clock_in_nanoseconds_is_refused() -> None:
+    live, pose = LiveFrames(), empty_scene(1, 1, 2, like=torch.zeros(()))
+    with pytest.raises(ValueError, match="expected seconds, not nanoseconds"):
+        live.add(pose, 1.7e18)
+    assert live.add(pose, 1.7e9) is None  # seconds since 1970
