@@ -53,7 +53,7 @@ def load(
             `SamplerOptions(settle="hold")`.
 
     Raises:
-        ValueError: no such model or sampler (the message lists them), or no such device.
+        ValueError: no such model or sampler (the message says what there is), or no such device.
         ImportError: a hub's model without huggingface_hub, `pip install "magnet-motion[hub]"`.
 
     >>> model = load("duet", steps=2)
@@ -65,13 +65,17 @@ def load(
     said: dict[str, Any] = {} if steps is None else {"steps": steps}
     if isinstance(sampler, SamplerOptions):
         options = dataclasses.replace(sampler, **said)
-    else:
+    elif isinstance(sampler, str):
         options = SamplerOptions.preset(sampler, **said)
+    else:
+        raise ValueError(
+            f"sampler: got {sampler!r}, expected a preset's name or SamplerOptions(steps=2) of magnet.sampling.options"
+        )
     return Model(DenoiserCore.load(name_or_path).to(place), options)
 
 
 def read(
-    *paths: str | Path,
+    *paths: str | Path | Sequence[str | Path],
     body: str | Path | Body | None = None,
     fps: float | None = FPS,
     trim: bool = False,
@@ -86,6 +90,7 @@ def read(
     """Read a scene from our own file, SMPL-X npz files or BVH files of any skeleton; several files are several people.
 
     Args:
+        paths: the files, or lists of them.
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
         trim, unit, up, joints, keep_floor, in_fps, start, end: as in `magnet.export.formats.Reading`. A unit or axis
@@ -96,7 +101,8 @@ def read(
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
     options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
-    got = formats.read(list(paths), body, options)
+    files = [file for each in paths for file in ([each] if isinstance(each, str | Path) else each)]
+    got = formats.read(files, body, options)
     for warning in formats.warned(got.notes):
         warnings.warn(warning, stacklevel=2)
     return Motion.of(got.scene, got.body, got.notes)
@@ -226,13 +232,26 @@ class Model:
         return self.predict(scene, "partner_inpainting", context=0, seed=seed, samples=samples, target=targets)
 
     def react(
-        self, scene: Scene, agent: int = 0, *, context: int = 32, seed: int | None = None, samples: int = 1
+        self,
+        scene: Scene,
+        agent: int = 0,
+        *,
+        context: int = 32,
+        block: int = 1,
+        seed: int | None = None,
+        samples: int = 1,
     ) -> Motion:
-        """Generate an agent's reaction, from frame `context` on, to the others' motion up to each moment."""
-        target = _slots("agent", agent)
-        return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, target=target)
+        """Generate an agent's reaction, from frame `context` on, to the others' motion up to each moment.
 
-    def partner(self, past: Scene, agents: int | Sequence[int] = 0, *, seed: int | None = None) -> LivePartner:
+        Args:
+            block: token steps (of 4 frames) that are generated at a time; the others are seen up to their end.
+        """
+        fields: dict[str, Any] = {"target": _slots("agent", agent), "block": block}
+        return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, **fields)
+
+    def partner(
+        self, past: Scene, agents: int | Sequence[int] = 0, *, block: int = 1, seed: int | None = None
+    ) -> LivePartner:
         """Agents who react live: pass the others' newest frames, at least 4, to `partner(past).answer(frames)`.
 
         Answers are `Motion`s, with the body of `past`.
@@ -240,12 +259,13 @@ class Model:
         Args:
             past: recent motion of everybody; a second is enough.
             agents: slots of the agents who react.
+            block: token steps (of 4 frames) that are answered at a time; `answer` takes a whole number of these.
 
         Raises:
             ValueError: as `magnet.generation.partner.Partner`.
         """
         plain, body = _with_its_body(past, "past")
-        how = (_slots("agents", agents), self.sampler, self._generator(seed))
+        how = (_slots("agents", agents), self.sampler, self._generator(seed), block)
         partner = LivePartner(self.denoiser, plain, *how)
         partner.model = body
         return partner

@@ -380,3 +380,10 @@ def test_scenes_and_models_say_in_one_line_what_they_are() -> None:
     assert repr(scene) == "Scene of 2 x 12 frames, 3 agents, 30 fps"
     assert repr(magnet.Motion.of(scene)) == "Motion of 2 x 12 frames, 3 agents, 30 fps"
     assert re.fullmatch(r"Model of up to \d+ people, sampled in \d+ steps", repr(magnet.load("duet")))
+
+
+def test_files_may_be_read_as_a_list_and_fields_of_a_sampler_are_refused(tmp_path: Path, duet: Scene) -> None:
+    paths = save_bvh(duet, tmp_path / "a.bvh", load_body())
+    assert torch.equal(magnet.read(paths).T_world_root, magnet.read(*paths).T_world_root)
+    with pytest.raises(ValueError, match=r"sampler: got \{'steps': 2\}, expected a preset's name or SamplerOptions"):
+        magnet.load("duet", sampler={"steps": 2})  # type: ignore[arg-type]

@@ -198,7 +198,8 @@ class NoiseStream:
         scale: standard deviation of that new noise.
 
     Raises:
-        ValueError: another number of generators than scenes, eta outside 0 to 1, or a scale that is not over 0.
+        ValueError: what is no generator, another number of generators than scenes, eta outside 0 to 1, or a scale that
+            is not over 0.
     """
 
     shape: tuple[int, int, int]
@@ -209,12 +210,15 @@ class NoiseStream:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
+        each = self.generator if isinstance(self.generator, Sequence) else [self.generator]
+        for one in each:
+            if one is not None and not isinstance(one, torch.Generator):
+                raise ValueError(f"generator: got {one!r}, expected torch.Generator(), of a seed with .manual_seed(5)")
         if isinstance(self.generator, Sequence) and len(self.generator) != self.shape[0]:
             raise ValueError(f"got {len(self.generator)} generators for {self.shape[0]} scenes, expected one for each")
         require_number("eta", self.eta, 0, 1)
         require_number("scale", self.scale, over=0)
         # Drawn once, so that the noise of a step depends on its place alone, not on the order of the calls.
-        each = self.generator if isinstance(self.generator, Sequence) else [self.generator]
         drawn = (torch.randint(2**62, (), generator=g, device=self.device) for g in each if self.eta)
         self._seeds = [int(seed) for seed in drawn]  # one number, or one for each scene where each has a generator
         self._again = torch.Generator(device=self.device)  # seeded anew for each draw
