@@ -17,6 +17,7 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.generation.crowd_room import SMOOTHED, room_made
 from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settled_groups, settled_moments
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
@@ -47,7 +48,7 @@ PAIR = 9 * TOKEN_FRAMES
 
 
 def generate_crowd(
-    model: DenoiserCore,
+    model: DenoiserCore | Loaded,
     scene: Scene,
     task: Task,
     context: int,
@@ -70,7 +71,7 @@ def generate_crowd(
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
     """
-    made = []
+    model, made = denoiser_of(model), []
     for number in range(scene.scenes * samples):
         which = [number // samples]
         more = (options, generator, progress, stats, CHUNK, None if cond is None else cond[which])

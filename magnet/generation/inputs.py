@@ -20,7 +20,10 @@ from magnet.motion.tokens import TOKEN_FRAMES
 ROUNDED = 0.05
 """What a rotation's columns may be off: half precision and careless interpolation are not refused, scales are."""
 
-ANY_FLOOR = "give any_floor=True (--sampler.any_floor true)"
+ANY_FLOOR = (
+    "give magnet.load(name, sampler=SamplerOptions(any_floor=True)), of magnet.sampling.options, or "
+    "--sampler.any_floor true"
+)
 
 
 def check_request(

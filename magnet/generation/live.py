@@ -17,6 +17,7 @@ from torch import Tensor
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
@@ -82,7 +83,7 @@ class Live:
     prediction.
 
     Args:
-        model: a trained denoiser.
+        model: a trained denoiser, or what `magnet.load` returns.
         people: how many there are when a scene begins from nothing.
         start: a scene (B = 1) to go on from instead; whoever is present moves up to the first slots.
         partner: recorded motion (B = 1) of everybody, from which whoever is given is taken, in the same frames as the
@@ -100,14 +101,14 @@ class Live:
 
     def __init__(
         self,
-        model: DenoiserCore,
+        model: DenoiserCore | Loaded,
         people: int = 2,
         start: Scene | None = None,
         partner: Scene | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        self.model = model
-        self.generator = generator or torch.Generator(device=model.device).manual_seed(1)
+        self.model = denoiser_of(model)
+        self.generator = generator or torch.Generator(device=self.model.device).manual_seed(1)
         if partner is not None:
             require_rate(partner, "partner")
             require_one(partner)

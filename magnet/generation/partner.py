@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_request
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.online import OnlineRollout
 from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene, cat_time
@@ -47,7 +48,7 @@ class Partner:
     Threads may share one: each `answer` waits for the one before. What goes on elsewhere begins from `past`.
 
     Args:
-        denoiser: a trained model.
+        denoiser: a trained model, or what `magnet.load` returns.
         past: how it began: B scenes of everybody, of which the last whole tokens are used; a second is enough.
         agents: slots of those who answer.
         options: how they are sampled; fewer steps answer sooner.
@@ -62,14 +63,16 @@ class Partner:
 
     def __init__(
         self,
-        denoiser: DenoiserCore,
+        denoiser: DenoiserCore | Loaded,
         past: Scene,
         agents: Sequence[int] = (0,),
         options: SamplerOptions | None = None,
         generator: torch.Generator | None = None,
         block: int = 1,
     ) -> None:
+        denoiser = denoiser_of(denoiser)
         require_rate(past, "past")
+        past = past.detached()
         check_request(denoiser, past, 0, 0, 1)
         if past.frames < TOKEN_FRAMES:
             raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")
@@ -125,6 +128,7 @@ class Partner:
                 f"on with frame {row} of all that was fed to this one: its past goes up to there"
             )
         require_rate(frames, "frames")
+        frames = frames.detached()
         block = self.task.block * TOKEN_FRAMES
         if not frames.frames or frames.frames % block:
             raise ValueError(

@@ -27,6 +27,7 @@ from magnet.generation.conditioning import (
     task_lookahead_limit,
 )
 from magnet.generation.inputs import check_condition, check_given, check_request, whole_tokens
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
@@ -53,7 +54,7 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
 def generate(
-    model: DenoiserCore,
+    model: DenoiserCore | Loaded,
     scene: Scene,
     task: Task,
     context: int,
@@ -68,7 +69,7 @@ def generate(
     """Sample a task.
 
     Args:
-        model: the trained denoiser.
+        model: the trained denoiser, or what `magnet.load` returns; its sampler is not read.
         scene: B recordings; only what the task's schedule calls known is read.
         task: plans what is known and what is generated.
         context: frames recorded of everybody, a multiple of 4.
@@ -94,7 +95,7 @@ def generate(
 
 
 def stream(
-    model: DenoiserCore,
+    model: DenoiserCore | Loaded,
     scene: Scene,
     task: Task,
     context: int,
@@ -128,7 +129,7 @@ def stream(
     if chunk is not None:
         require_whole("chunk", chunk, 1)
     more = (options, generator, progress, stats, chunk, cond)
-    return Rollout(model, scene, task, context, frames, samples, *more).chunks()
+    return Rollout(denoiser_of(model), scene, task, context, frames, samples, *more).chunks()
 
 
 class Rollout:

@@ -11,6 +11,7 @@ from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.export.trace import DenoisingTrace
 from magnet.generation.causal_bodies import own_view
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import Rollout
 from magnet.generation.world import WorldState
 from magnet.motion.required import require_one, require_rate
@@ -23,7 +24,7 @@ from magnet.tasks.base import Task
 
 
 def record(
-    model: DenoiserCore,
+    model: DenoiserCore | Loaded,
     scene: Scene,
     task: Task,
     context: int,
@@ -44,7 +45,7 @@ def record(
     require_rate(scene)
     require_whole("frames", frames, 1)
     require_whole("every", every, 1)
-    stream = TracedRollout(model, scene, task, context, frames, options, generator, every)
+    stream = TracedRollout(denoiser_of(model), scene, task, context, frames, options, generator, every)
     with torch.no_grad():
         done = cat_time(list(stream.chunks())).to("cpu")
     slots = torch.arange(scene.agents)

@@ -127,6 +127,11 @@ class Scene:
         floats = {name: value.float() for name, value in self.tensors().items() if value.dtype != torch.bool}
         return self if all(value is getattr(self, name) for name, value in floats.items()) else self.replace(**floats)
 
+    def detached(self) -> Scene:
+        """The same scene, of which no gradient is taken."""
+        floats = {name: value.detach() for name, value in self.tensors().items() if value.requires_grad}
+        return self.replace(**floats) if floats else self
+
     def slice(self, start: int, stop: int | None = None) -> Scene:
         """Frames `start:stop` of every scene."""
         return self.frames_at(builtins.slice(start, stop))

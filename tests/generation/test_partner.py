@@ -387,3 +387,8 @@ def test_weights_are_looked_at_once_a_stage(model, duet, monkeypatch):
     monkeypatch.setattr(rollout, "lean", lambda *asked: (looked.append(asked), lean(*asked))[1])
     partner.answer(duet.slice(16, 20))
     assert len(looked) == 1 < FAST.steps
+
+
+def test_tensors_that_require_grad_are_answered(model, duet):
+    learned = duet.replace(T_world_root=duet.T_world_root.clone().requires_grad_())
+    assert torch.equal(answered(model, learned).T_world_root, answered(model, duet).T_world_root)
