@@ -107,9 +107,9 @@ def read(
         bvh = {name: value for name, value in vars(options).items() if name != "in_fps"}
         imported = load_bvh(files, body, **bvh)
         notes = [str(source) for source in imported.sources]
-        if imported.floor:
-            way = "lowered" if imported.floor > 0 else "raised"
-            notes.append(f"everybody was {way} by {100 * abs(imported.floor):.1f} cm onto the floor")
+        if abs(imported.floor) >= UNSEEN:
+            way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
+            notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import magnet
 from magnet import checkpoints, cli
 from magnet.body import Body, load_body, on_floor
 from magnet.body.joints import JOINT_NAMES
-from magnet.export import formats, resampled, save_smplx
+from magnet.export import formats, load_bvh, resampled, save_smplx
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene, cat_agents
 from magnet.testing import random_scene
@@ -285,6 +286,17 @@ def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, t
     for name, smplx in (("a.npz", False), ("b.npz", True), ("c.bvh", False)):
         notes = formats.read(formats.write(duet, tmp_path / name, body, smplx=smplx)).notes
         assert not any("y = 0" in note or "floor" in note for note in notes)
+
+
+def test_a_bvh_that_is_moved_onto_the_floor_says_so_and_names_what_leaves_it(
+    duet: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = formats.write(duet, tmp_path / "a.bvh", body)[0]
+    for metres, said in ((0.0004, None), (0.1, "lowered by 10.0 cm"), (-0.1, "raised by 10.0 cm")):
+        found = replace(load_bvh(path, body), floor=metres)
+        monkeypatch.setattr(formats, "load_bvh", lambda *_, found=found, **__: found)
+        notes = [note for note in formats.read(path).notes if "onto the floor" in note]
+        assert notes == ([f"everybody was {said} onto the floor; --keep_floor leaves them"] if said else [])
 
 
 def test_a_new_format_is_a_function_and_a_line(duet, tmp_path, body, monkeypatch, capsys):
