@@ -14,6 +14,7 @@ from magnet.cli import predict_keys, predict_written, scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import taken_out
 from magnet.cli.predict_lengths import CONTEXT, FUTURE, lengths
+from magnet.sampling.presets import PRESETS
 
 if TYPE_CHECKING:
     from magnet.api import Model
@@ -83,7 +84,7 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument_group("how").add_argument
     add("--seed", type=int, default=1111, help="seed of all noise (default: %(default)s)")
     add("--ckpt_path", metavar="NAME", help="shipped weights, a checkpoint, best or last")
-    add("--sampler", metavar="PRESET", help="default, plain, steady or paper")
+    add("--sampler", metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
     add("--sampler.FIELD", metavar="VALUE", help="an option of the sampler, which beats it")
     scene_files.add_look(options.add_argument_group("films"))
     files = options.add_argument_group("files")

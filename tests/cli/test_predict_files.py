@@ -15,6 +15,7 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.export import formats, save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
+from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry
 from tests.cases import few, some_quick, some_slow
 
@@ -277,6 +278,12 @@ def test_a_mistake_is_answered_by_what_would_be_right(
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not list(tmp_path.glob("a.*"))
+
+
+def test_help_of_files_names_every_preset(capsys) -> None:
+    assert cli.main(["predict", "--help", "files"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"--sampler PRESET how to sample: {' or '.join(PRESETS)}" in said
 
 
 def test_a_data_set_is_still_sampled_without_files() -> None:
