@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -53,7 +53,8 @@ def render_video(
             in the time bar.
         body: the scenes' body model; the packaged one if None.
         style: `skeleton` strokes, `capsules` mannequins, the `body`'s own skin, or a `light` one of fewer triangles.
-        fps: frames a second of the film; frames of the scene are repeated or left out.
+        fps: frames a second of the film; frames of the scene are repeated or left out. A .gif or .webp has at most 50,
+            so above that some are left out, evenly: viewers slow down frames of less than 20 ms.
         size: pixels of one panel, even numbers.
         ghosts: a scene (B = 1) drawn pale in every panel, such as the ground truth.
         trail: seconds of each pelvis's path that are drawn on the floor.
@@ -205,10 +206,15 @@ def paint(people: Cast, view: View, frame: int, ghost: Array | None = None, trai
 # -- files -------------------------------------------------------------------------------------
 
 
-def _frames(film: Film, report: Report) -> Iterator[Image.Image]:
-    for index in range(film.frames):
+SHORTEST = 20
+"""Milliseconds of a frame of .gif and .webp, at least: browsers show shorter ones more slowly than they say."""
+
+
+def _frames(film: Film, report: Report, shown: Sequence[int] | None = None) -> Iterator[Image.Image]:
+    shown = range(film.frames) if shown is None else shown
+    for done, index in enumerate(shown, start=1):
         yield film.draw(index)
-        report(index + 1, film.frames)
+        report(done, len(shown))
 
 
 def require_av() -> None:
@@ -239,19 +245,28 @@ def _write_gif(film: Film, path: Path, report: Report) -> None:
     # One palette from the start, the middle and the end, so that colours do not flicker.
     probes = [np.asarray(film.draw(i)) for i in sorted({0, film.frames // 2, film.frames - 1})]
     palette = Image.fromarray(np.concatenate(probes)).quantize(200, method=Image.Quantize.MEDIANCUT)
-    images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _frames(film, report))
-    next(images).save(path, save_all=True, append_images=images, duration=_durations(film, 10), loop=0, disposal=1)
+    shown, lasting = _timed(film, 10)
+    images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _frames(film, report, shown))
+    next(images).save(path, save_all=True, append_images=images, duration=lasting, loop=0, disposal=1)
 
 
 def _write_webp(film: Film, path: Path, report: Report) -> None:
-    first, *rest = _frames(film, report)
-    first.save(path, save_all=True, append_images=rest, duration=_durations(film, 1), loop=0, quality=75, method=2)
+    shown, lasting = _timed(film, 1)
+    first, *rest = _frames(film, report, shown)
+    first.save(path, save_all=True, append_images=rest, duration=lasting, loop=0, quality=75, method=2)
 
 
-def _durations(film: Film, tick: int) -> list[int]:
-    """Milliseconds of each frame, rounded to ticks so that errors do not add up."""
-    ends = np.round(np.arange(film.frames + 1) * 1000 / film.fps / tick) * tick
-    return np.maximum(np.diff(ends), tick).astype(int).tolist()
+def _timed(film: Film, tick: int) -> tuple[list[int], list[int]]:
+    """The frames that are shown, none for less than `SHORTEST`, and milliseconds of each.
+
+    Milliseconds are rounded to ticks so that errors do not add up.
+    """
+    step = max(1, math.ceil(SHORTEST * film.fps / 1000 - 1e-6))
+    shown = list(range(0, film.frames, step))
+    ends = np.round(np.array([*shown, film.frames]) * 1000 / film.fps / tick) * tick
+    if len(shown) > 1 and ends[-1] - ends[-2] < SHORTEST:  # the last is part of the one before it
+        shown, ends = shown[:-1], np.delete(ends, -2)
+    return shown, np.maximum(np.diff(ends), SHORTEST).astype(int).tolist()
 
 
 @contextmanager

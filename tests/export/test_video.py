@@ -58,6 +58,23 @@ def test_a_file_holds_the_scenes_seconds_at_the_fps_asked_for(
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+@pytest.mark.parametrize("fps", [30.0, 60.0, 120.0, 240.0])
+def test_a_fast_scene_lasts_as_long_as_it_does_and_no_frame_is_too_short_for_browsers(
+    suffix: str, fps: float, body: Body, tmp_path: Path
+) -> None:
+    scene = random_scene(1, round(0.6 * fps) + 1, 1, torch.Generator().manual_seed(1)).replace(fps=fps)
+    path = render_video(scene, tmp_path / f"a{suffix}", context_frames=0, body=body, fps=fps, size=(64, 48))
+    lasting = []
+    with Image.open(path) as file:
+        for index in range(file.n_frames):
+            file.seek(index)
+            file.load()
+            lasting.append(file.info["duration"])
+    assert min(lasting) >= 20
+    assert sum(lasting) == pytest.approx(1000 * scene.frames / fps, abs=10 if suffix == ".gif" else 1)
+
+
 @pytest.mark.parametrize("style", some_slow(STYLES, "light"))
 def test_known_frames_are_pink_and_generated_ones_are_not(
     style: Style, duet: Scene, body: Body, pixels_like: Count
