@@ -100,6 +100,12 @@ def main(arguments: Sequence[str] = ()) -> int:
     start = read(given.scene).plain()
     names = tuple(map(str.strip, given.names.split(",") if given.names else string.ascii_uppercase[: start.agents]))
     connect = peers(given.connect, names, given.name, given.listen)
+    if not connect and given.play is None and (others := [name for name in names if name != given.name]):
+        print(
+            f"magnet: {given.name} runs alone, and hears nobody: --connect {others[0]}=tcp://HOST:PORT, where "
+            f"{others[0]} listens, connects it",
+            file=sys.stderr,
+        )
     member = member_of(given, start, names)
     link = zeromq.Link(given.name, given.listen, connect, given.keys)
     try:

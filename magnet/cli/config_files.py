@@ -64,6 +64,8 @@ def read_yaml(file: str) -> dict[str, Any]:
     if not path.is_file():
         near = sorted(str(p) for p in path.parent.glob("[!.]*.yaml")) if path.parent.is_dir() else []
         hint = f"; there are {', '.join(near)}" if near else ""
+        if not near and path.parent.name == "configs":
+            hint = "; configs/ is in a clone of the repository: run it there, or name the file's path in it"
         raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
     try:
         content = yaml.safe_load(path.read_text())

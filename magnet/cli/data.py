@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli import answers
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
+    TUNING,
+    WHERE_CONFIGS,
     add_list,
     file_bars,
     run_list,
@@ -301,8 +303,9 @@ def run_prepare(given: argparse.Namespace) -> int:
     print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
     longest = int(report.folder.split("test").frames.max(initial=0))
     if kind.own:
-        tuned = f"magnet fit --config configs/finetune.yaml --data.path {place}{body}"
-        print(f"  {tuned}{shorter_tests(longest, TUNED_HORIZON)}   # the shipped model goes on with it")
+        tuned = f"magnet fit --config {TUNING} --data.path {place}{body}"
+        note = f"the shipped model goes on with it; {WHERE_CONFIGS}"
+        print(f"  {tuned}{shorter_tests(longest, TUNED_HORIZON)}   # {note}")
     usual = f"{registry.fit_command(registry.data_of(kind))} --data.path {place}{body}"
     print(f"  {usual}{shorter_tests(longest, HELD_OUT.horizon_frames)}")
     return 0

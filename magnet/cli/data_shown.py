@@ -70,7 +70,7 @@ def show_reader(console: Console, kind: type[Reader]) -> None:
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
     show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
     if kind.own:
-        show(console, "", "magnet fit --config configs/finetune.yaml --data.path STORE")
+        show(console, "", f"magnet fit --config {TUNING} --data.path STORE   # {WHERE_CONFIGS}")
     show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
     if body:
         show(console, "", WHERE[kind.family])
@@ -95,6 +95,7 @@ def show(console: Console, what: str, text: str) -> None:
 
 
 SKIPPED_SHOWN = 20
+TUNING, WHERE_CONFIGS = "configs/finetune.yaml", "configs/ is in a clone of the repository"
 PROBLEMS_SHOWN = 40
 PERSONS_SHOWN = 8
 NOTES_SHOWN = 8

@@ -26,6 +26,7 @@ from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.errors import CommandError
 from magnet.cli.pipes import output_closed
 from magnet.cli.provenance import provenance
+from magnet.files import require_place
 from magnet.version import __version__
 
 MONITOR = "val/loss"
@@ -304,8 +305,14 @@ class Record(Callback):
         self.goes_on, self.command, self.begun = goes_on, command, False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Take the first process's folder: each names one by its own clock."""
+        """Take the first process's folder: each names one by its own clock.
+
+        Raises:
+            CannotWrite: it cannot be written.
+        """
         self.folder = Path(trainer.strategy.broadcast(str(self.folder)))
+        if trainer.is_global_zero and not getattr(trainer, "fast_dev_run", False):
+            require_place(self.folder / "run.json")  # before anything is sampled
 
     def _begin(self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any) -> None:
         """Write, once data, model and task have turned out to fit: a run that never began leaves nothing behind."""

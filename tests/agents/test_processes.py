@@ -19,6 +19,7 @@ import torch
 from magnet.agents.agent import poses_of
 from magnet.agents.message import unpack
 from magnet.agents.zeromq import Link, engine, make_keys
+from magnet.cli import agent
 from magnet.cli.agent import peers
 from magnet.cli.errors import CommandError
 from magnet.denoiser.module import Denoiser
@@ -245,3 +246,12 @@ def test_over_a_bad_line_processes_go_on_and_fill_in_what_was_late(folder):
     for report in reports:
         assert report["tokens"] == 60 and report["refused"] == {} and report["taken"] > 30
     assert sum(report["gaps"] for report in reports) > 0 and sum(report["filled"] for report in reports) > 0
+
+
+def test_an_agent_who_hears_nobody_says_so(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("magnet.cli.agent.take_part", lambda *_: None)
+    words = ["--name", "A", "--scene", str(folder / "two.npz"), "--model", str(folder / "model.ckpt")]
+    assert agent.main([*words, "--listen", addresses_of("A")["A"]]) == 0
+    assert "A runs alone, and hears nobody: --connect B=tcp://HOST:PORT" in capsys.readouterr().err

@@ -8,8 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from lightning.pytorch import LightningModule, Trainer
 
 from magnet.cli import run_folder
+from magnet.files import CannotWrite
 
 FLAGS = {
     "data.train_clips": 4, "data.val_clips": 2, "data.batch_size": 2, "data.epoch_size": 8, "data.window_frames": 16,
@@ -76,3 +78,10 @@ def test_the_first_process_is_known_whoever_started_it(
     for name, value in said.items():
         monkeypatch.setenv(name, value)
     assert run_folder.first_process() == first
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    record = run_folder.Record(tmp_path / "file" / "run", "", {}, {}, command="test")
+    with pytest.raises(CannotWrite, match="is a file, expected a folder"):
+        record.setup(Trainer(logger=False, accelerator="cpu"), LightningModule(), "test")
