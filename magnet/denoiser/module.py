@@ -147,7 +147,8 @@ class Denoiser(DenoiserCore, TokenModel):
         layout, weight = self.layout, self.loss
         with torch.no_grad():
             tokens, there = self.tokenize(scene)
-            scene = scene.pad_agents(layout.agents).replace(names=())  # by which a GPU would be waited for
+            named = scene.pad_agents(layout.agents)
+            scene = named.replace(names=())  # by which a GPU would be waited for
             truth = self.normalizer.normalize(tokens)
             B, N, P, _ = truth.shape
             levels = draw_levels(self.noise, B, N, P, generator, scene.present)
@@ -155,7 +156,7 @@ class Denoiser(DenoiserCore, TokenModel):
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
             noise = torch.randn(truth.shape, generator=generator, device=truth.device)
-            cond = self.shown_condition(scene, generator)
+            cond = self.shown_condition(named, generator)
             shown = self._self_forced(truth, levels, scene, cond, generator)
             noisy = add_noise(shown, noise, layout.spread(group_levels))
         own = self.predict_tokens(noisy, levels, scene.present, cond)

@@ -78,10 +78,10 @@ class SceneValues:
         return SceneValues(scenes, units, rows, facts)
 
     def sums(self, method: str, metric: str, scenes: Iterable[str]) -> Floats:
-        """Sums and counts of some scenes. -> (B, 2)"""
+        """Sums and counts of some scenes; 0 of those where the metric has no number. -> (B, 2)"""
         place = {name: number for number, name in enumerate(self.scenes)}
-        chosen = self.rows[method][metric][[place[name] for name in scenes]]
-        return np.stack([np.nan_to_num(chosen[:, 0]) * chosen[:, 1], chosen[:, 1]], axis=1)
+        value, weight = self.rows[method][metric][[place[name] for name in scenes]].T
+        return np.stack([np.nan_to_num(value) * weight, np.where(np.isnan(value), 0.0, weight)], axis=1)
 
 
 def _written(values: Floats) -> dict[str, Any]:

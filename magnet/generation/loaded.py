@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from magnet.denoiser.core import DenoiserCore
 
@@ -20,7 +20,8 @@ def denoiser_of(model: DenoiserCore | Loaded) -> DenoiserCore:
     Raises:
         ValueError: neither.
     """
-    denoiser: DenoiserCore = getattr(model, "denoiser", model)
+    denoiser: Any = getattr(model, "denoiser", model)
     if not hasattr(denoiser, "require_tokenizer"):
         raise ValueError(f'model: got {type(model).__name__}, expected a model, such as magnet.load("duet")')
-    return denoiser
+    found: DenoiserCore = denoiser
+    return found

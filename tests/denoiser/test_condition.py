@@ -171,3 +171,21 @@ def test_a_model_with_one_starts_as_the_model_without_that_it_starts_from(tmp_pa
         expected = plain.denoise(noisy, levels, present)
         for cond in (None, torch.randn(2, 4)):
             assert torch.equal(told.denoise(noisy, levels, present, cond), expected)
+
+
+def test_in_training_scenes_have_their_names() -> None:
+    """A text belongs to a clip, and a scene's name tells whose."""
+    told: list[tuple[str, ...]] = []
+
+    class ToldByName(Denoiser):
+        def condition(self, scene: Scene) -> torch.Tensor:
+            told.append(scene.names)
+            return torch.tensor([[1.0 if name.startswith("waltz") else -1.0] for name in scene.names])
+
+    network = {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "cond_dim": 1}
+    model = ToldByName(max_agents=2, window=N, network=network)
+    model.build(tiny_tokenizer())
+    scene = two_dances().replace(names=("waltz [0:32]", "salsa [0:32]"))
+    model.fit_normalizer(*model.tokenize(scene))
+    assert torch.isfinite(model.train().losses(scene, torch.Generator().manual_seed(1))["loss"])
+    assert told == [scene.names]

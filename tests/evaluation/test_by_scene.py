@@ -103,6 +103,15 @@ def test_a_scene_counts_where_one_of_both_has_something_in_it() -> None:
     assert math.isnan(found.second) and math.isnan(found.low) and found.better is None
 
 
+def test_a_scene_in_which_a_metric_has_no_number_does_not_count() -> None:
+    some = np.array([np.nan, 1.0, 2.0])
+    scenes = values(a=some, b=some + 1)
+    difference = compared(scenes, scenes, ("a", "b"), "m", "low", "truth")
+    assert (difference.first, difference.second, difference.difference) == (1.5, 2.5, 1.0)
+    none = values(a=np.full(3, np.nan), b=some)
+    assert math.isnan(compared(none, none, ("a", "b"), "m", "low", "truth").first)
+
+
 def test_noise_is_not_told_from_no_difference() -> None:
     both = values(a=drawn(1), b=drawn(2))
     found = compared(both, both, ("a", "b"), "m", "low", "truth")
