@@ -49,6 +49,11 @@ def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
         raise DataError(f"{name}: clips({split!r}) gave {type(clips).__name__}, expected a list of Clip")
     if strange := [clip for clip in clips if not isinstance(clip, Clip)]:
         raise DataError(f"{name}: clips({split!r}) gave {type(strange[0]).__name__} in its list, expected Clip")
+    if other := [clip for clip in clips if clip.split != split]:
+        raise DataError(
+            f"{name}: clips({split!r}) gave {other[0].name}, which is of split {other[0].split!r}; "
+            "give only those of the split that is asked for"
+        )
     return list(clips)
 
 

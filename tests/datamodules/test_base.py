@@ -339,6 +339,10 @@ def unfinished(self, split):
         (unfinished, r"clips\('train'\) fails: KeyError: 'train'; see docs/own.md"),
         (lambda self, split: None, r"clips\('train'\) gave NoneType, expected a list of Clip"),
         (lambda self, split: [random_clip("a"), 2], r"clips\('train'\) gave int in its list, expected Clip"),
+        (
+            lambda self, split: [random_clip("a"), replace(random_clip("b"), split="test")],
+            r"clips\('train'\) gave b, which is of split 'test'; give only those",
+        ),
     ],
 )
 @pytest.mark.parametrize("mixed", [False, True])

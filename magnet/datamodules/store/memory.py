@@ -95,7 +95,7 @@ class MemoryStore:
         body: str,
     ) -> None:
         """Keep all facts of each clip but its frames, and check the number of people."""
-        self.names, self.sources = list(names), np.array(sources, dtype=object)
+        self.names, self.sources = told_apart(names), np.array(sources, dtype=object)
         self.length, self.people = np.array(length, dtype=np.int64), np.array(people, dtype=np.int64)
         self.whole = np.array(whole, dtype=bool)  # every frame is valid
         self.max_agents, self.fps, self.body = max_agents, fps, body
@@ -282,3 +282,23 @@ def place_apart(
     heading = torch.stack([direction.sin(), direction.cos()], dim=-1)
     T_new_world = from_planar(yaw, near + distance[:, None] * heading - rotate_ground(yaw, far))
     return torch.where(theirs[:, None, :, None, None], T_new_world[:, None, None] @ T_world_root, T_world_root)
+
+
+def told_apart(names: Sequence[str]) -> list[str]:
+    """Names of clips, of which those that are there already get a number: data sets that are mixed may share some.
+
+    >>> told_apart(["walk", "wave", "walk", "walk"])
+    ['walk', 'wave', 'walk (2)', 'walk (3)']
+    """
+    if len(set(names)) == len(names):
+        return list(names)
+    taken, given = set(names), []
+    seen: dict[str, int] = {}
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        title = name
+        while seen[name] > 1 and (title := f"{name} ({seen[name]})") in taken:
+            seen[name] += 1
+        taken.add(title)
+        given.append(title)
+    return given
