@@ -5,6 +5,7 @@ Arrays here are numpy, world metres, y up. Nothing is random.
 
 from __future__ import annotations
 
+import unicodedata
 from dataclasses import dataclass
 
 import numpy as np
@@ -308,6 +309,24 @@ def strokes(
     return np.concatenate([arc(end, to_radius, far), arc(start, from_radius, near)], axis=1)
 
 
+SPELLED = {
+    **{"ß": "ss", "æ": "ae", "Æ": "AE", "œ": "oe", "Œ": "OE", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L"},
+    **{"đ": "d", "Đ": "D", "ð": "d", "Ð": "D", "þ": "th", "Þ": "Th", "\u0131": "i", "ħ": "h", "Ħ": "H"},
+    **dict.fromkeys("\u2010\u2011\u2012\u2013—\u2015\u2212", "-"),
+    **{"•": "·", "\u00d7": "x", "÷": "/", "€": "EUR"},
+}
+HELD = frozenset("©«°±\u00b4·»\u2018\u2019“”…\u2039\u203a\u2044")
+"""Characters beyond ASCII that `font` has."""
+
+
+def drawable(text: str) -> str:
+    """Text in characters that `font` has: letters without their accents, plain dashes, `?` for what is left."""
+    spelled = "".join(SPELLED.get(letter, letter) for letter in text)
+    parts = (part if part in HELD else unicodedata.normalize("NFKD", part) for part in spelled)
+    plain = (part for part in "".join(parts) if not unicodedata.combining(part))
+    return "".join(part if part.isascii() or part in HELD else SPELLED.get(part, "?") for part in plain)
+
+
 def font(pixels: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own font, so that pictures look the same everywhere."""
+    """Pillow's own font, so that pictures look the same everywhere. It has no accents: draw `drawable` text."""
     return ImageFont.load_default(size=pixels)

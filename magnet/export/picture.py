@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from magnet.body import Body
 from magnet.export.cast import Scenes, Style, cast, default_body, known_frames, panels
-from magnet.export.drawing import INK, Camera, Size, font, plan_views
+from magnet.export.drawing import INK, Camera, Size, drawable, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
 
 
@@ -44,7 +44,7 @@ def contact_sheet(
     Raises:
         ValueError: scenes that cannot be drawn, or a frame outside them.
     """
-    rows = panels(scenes)
+    rows = [(drawable(label), scene) for label, scene in panels(scenes)]
     first = rows[0][1]
     body = body or default_body(first)
     people = [cast(s, body, style, known_frames(s, context_frames)) for _, s in rows]
@@ -58,7 +58,7 @@ def contact_sheet(
     page = Image.new("RGB", (left + len(moments) * cell[0], top + len(rows) * cell[1]), PAGE)
     draw = ImageDraw.Draw(page)
     if title:
-        draw.text((12 * unit, 22 * unit), title, fill=INK, font=font(20 * unit), anchor="lm")
+        draw.text((12 * unit, 22 * unit), drawable(title), fill=INK, font=font(20 * unit), anchor="lm")
     context = context_frames or people[0].context
     for i, moment in enumerate(moments):
         ink = PINK if moment < context else GENERATED

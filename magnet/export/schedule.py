@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from magnet.export.drawing import AGENTS, CONTEXT, INK, PALE, Colour, font
+from magnet.export.drawing import AGENTS, CONTEXT, INK, PALE, Colour, drawable, font
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import MaskSchedule, initial_levels
 
@@ -164,6 +164,7 @@ def draw_schedule(
     path = Path(path)
     if path.suffix != ".png":
         raise ValueError(f"{path.name}: pictures are written as .png")
+    title, subtitle = drawable(title), drawable(subtitle)
     rows = moments(schedule, count)
     columns = thinned(schedule.tokens, MAX_COLUMNS)
     wide = unit * max(2, min(26, 620 // len(columns)))

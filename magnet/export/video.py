@@ -15,7 +15,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from magnet.body import Body
 from magnet.export.cast import Cast, Scenes, Style, cast, default_body, known_frames, panels
-from magnet.export.drawing import CONTEXT, INK, PALE, Array, Camera, Canvas, Size, View, font, plan_views, require_size
+from magnet.export.drawing import (
+    CONTEXT,
+    INK,
+    PALE,
+    Array,
+    Camera,
+    Canvas,
+    Size,
+    View,
+    drawable,
+    font,
+    plan_views,
+    require_size,
+)
 from magnet.export.figures import add_ghosts, add_shadows
 from magnet.motion.scene import FPS, Scene
 
@@ -108,9 +121,10 @@ class Film:
         labelled = panels(scenes)
         first = labelled[0][1]
         body = body or default_body(first)
-        self.fps, self.size, self.title, self.trail, self.speed = fps, size, title, trail, speed
+        self.fps, self.size, self.trail, self.speed = fps, size, trail, speed
+        self.title = None if title is None else drawable(title)
         self.scene_fps = first.fps
-        self.labels = [label for label, _ in labelled]
+        self.labels = [drawable(label) for label, _ in labelled]
         self.casts = [cast(s, body, style, known_frames(s, context_frames)) for _, s in labelled]
         self.ghost = None if ghosts is None else cast(ghosts, body, "skeleton").joints
         if self.ghost is not None and len(self.ghost) != self.casts[0].frames:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from magnet.body.joints import PARENTS
-from magnet.export.drawing import AGENTS, BACKGROUND, INK, TILES, font
+from magnet.export.drawing import AGENTS, BACKGROUND, INK, TILES, drawable, font
 from magnet.files import load_npz, write_whole
 from magnet.motion.scene import FPS
 
@@ -68,7 +68,7 @@ def film(rows: Mapping[str, Joints], fps: float = FPS) -> bytes:
 def wrapped(text: str, width: float) -> list[str]:
     """Lines of a title that are no wider than so many pixels, words whole."""
     lines: list[str] = []
-    for word in text.split():
+    for word in drawable(text).split():
         longer = f"{lines[-1]} {word}" if lines else word
         if lines and font(12).getlength(longer) <= width:
             lines[-1] = longer
