@@ -73,9 +73,9 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.export.npz import is_open
 
     out = scene_files.path_to_write(options.out, options.inputs, tuple(options.size), not options.person)
-    refuse_unused(options, out.suffix.lower())
     if options.context < 0:
         raise CommandError(f"--context {options.context}: expected 0 frames or more")
+    refuse_unused(options, out.suffix.lower())
     film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
     reading = scene_files.reading(options, None if film and len(options.inputs) == 1 else options.fps)
     got = scene_files.read_inputs(options, reading)
@@ -123,8 +123,9 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
     Raises:
         CommandError: names the option and what it is for.
     """
-    from magnet.export.formats import USD
+    from magnet.export.formats import FILM, PICTURES, USD
 
+    shown = (".html", ".png", *PICTURES)
     bones = (".glb", ".fbx", *USD)
     if options.each and not options.smplx:
         raise CommandError("--each: a file per person is for --smplx")
@@ -134,8 +135,13 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
         ("names", "smplx", (".bvh", *bones)),
         ("root", "floor", bones),
         ("clips", "scene", (".glb",)),
+        ("context", 0, shown),
+        ("style", "body", shown),
+        ("size", FILM, PICTURES),
+        ("title", None, shown),
     ):
-        if getattr(options, flag) != plain and suffix not in takes:
+        said = getattr(options, flag)
+        if (tuple(said) if flag == "size" else said) != plain and suffix not in takes:
             raise CommandError(f"--{flag}: is for {', '.join(takes)}, and does nothing in {suffix}")
 
 

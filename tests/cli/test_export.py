@@ -45,6 +45,10 @@ def test_one_scene_of_several_becomes_one_file(stored: Path, capsys: pytest.Capt
         ("csv", ["--names", "mixamo"], "--names: is for .bvh, .glb, .fbx"),
         ("bvh", ["--root", "none"], "--root: is for .glb, .fbx"),
         ("usda", ["--clips", "person"], "--clips: is for .glb"),
+        ("csv", ["--title", "Duet"], "--title: is for .html, .png, .mp4, .gif, .webp, and does nothing in .csv"),
+        ("bvh", ["--style", "light"], "--style: is for .html, .png, .mp4"),
+        ("npz", ["--context", "4"], "--context: is for .html, .png, .mp4"),
+        ("png", ["--size", "320", "240"], "--size: is for .mp4, .gif, .webp, and does nothing in .png"),
     ],
 )
 def test_what_a_format_has_no_use_for_is_refused(
@@ -114,7 +118,8 @@ def test_every_suffix_is_written_by_the_command(suffix: str, stored: Path, capsy
     if suffix == "mp4":
         pytest.importorskip("av", reason="PyAV is not installed")
     out = stored.with_name(f"a.{suffix}")
-    assert cli.main(["export", str(stored), str(out), "--scene", "0", "--style", "skeleton", "--fps", "10"]) == 0
+    style = ["--style", "skeleton"] if suffix in ("html", "mp4", "gif", "webp", "png") else []
+    assert cli.main(["export", str(stored), str(out), "--scene", "0", *style, "--fps", "10"]) == 0
     written = re.findall(r"written: (\S+) ", capsys.readouterr().out)
     assert written and all(Path(path).suffix == out.suffix and Path(path).stat().st_size > 1000 for path in written)
     assert len(written) == (2 if suffix == "bvh" else 1)

@@ -317,7 +317,7 @@ def test_refine_refuses_what_means_nothing(
 def test_options_that_a_scene_of_ours_has_no_use_for_are_refused(
     words: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert said in refused(capsys, "export", "duet.npz", "o.glb", *words)
+    assert said in refused(capsys, "export", "duet.npz", "o.html", *words)
 
 
 def test_less_than_a_token_is_said_to_be_too_little(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
