@@ -45,7 +45,7 @@ def lengths(
     if options.context is None and context:
         beyond = max(scene.frames - context, options.frames or FUTURE)
         context = fitting(context, choice.task, recorded, planned(context, beyond))
-    elif within := [step for step in keys_of(choice.task, recorded) if step * TOKEN_FRAMES < context]:
+    elif within := [step for step in keys_of(choice.task, recorded) if 0 <= step * TOKEN_FRAMES < context]:
         print(f"--context {context}: in it lie the keyframes at token steps {', '.join(map(str, within))}")
     rest = options.frames or (scene.frames - context if recorded > context else 0) or FUTURE
     if added:  # planned with a past, for tasks that need one refuse to be planned without
