@@ -17,7 +17,7 @@ from magnet.body import Body
 from magnet.body.floor import open_body
 from magnet.checks import require_whole, require_wholes
 from magnet.denoiser.core import DenoiserCore
-from magnet.export import formats
+from magnet.export import reading
 from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
@@ -93,17 +93,17 @@ def read(
         paths: the files, or lists of them.
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor, in_fps, start, end: as in `magnet.export.formats.Reading`. A unit or axis
+        trim, unit, up, joints, keep_floor, in_fps, start, end: as in `magnet.export.reading.Reading`. A unit or axis
             that nobody can have is taken as it is said, with a warning that names what the files look like.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
-    options = formats.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
+    options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
     files = [file for each in paths for file in ([each] if isinstance(each, str | Path) else each)]
-    got = formats.read(files, body, options)
-    for warning in formats.warned(got.notes):
+    got = reading.read(files, body, options)
+    for warning in reading.warned(got.notes):
         warnings.warn(warning, stacklevel=2)
     return Motion.of(got.scene, got.body, got.notes)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 HELP = "magnet predict --help files"
 READ = (".npz", ".bvh")
-"""`magnet.export.formats.READ`, which would import torch."""
+"""`magnet.export.reading.READ`, which would import torch."""
 
 EPILOG = """\
 IN is a .bvh of any skeleton, an SMPL-X .npz or a scene of ours; several are several people of one world, in the order
@@ -193,7 +193,7 @@ def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
     """The people of all files, or a scene of nobody, and its body.
 
     Raises:
-        ValueError, OSError: as `formats.read`.
+        ValueError, OSError: as `magnet.export.reading.read`.
     """
     import torch
 

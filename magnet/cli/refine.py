@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from magnet.body import Body
-    from magnet.export.formats import Read
+    from magnet.export.reading import Read, Reading
     from magnet.motion.scene import Scene
 
 EPILOG = """\
@@ -67,6 +67,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.body.other_shapes import with_shapes
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.export import formats
+    from magnet.export.reading import shared
     from magnet.files import require_place
 
     out = scene_files.path_to_write(options.out, options.inputs)
@@ -78,7 +79,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
     if options.plot:
         require_place(options.plot)
-    got = scene_files.read_inputs(options, scene_files.reading(options))
+    lend = [] if options.shapes in (None, ["exchange"]) else options.shapes
+    how_read, how_lent = shared(scene_files.reading(options), options.inputs, lend or options.inputs)
+    got = scene_files.read_inputs(options, how_read)
     read = [*options.inputs, *(options.shapes or ())]
     scene_files.require_unread(out, read, scene_files.slots_of(got.scene))
     formats.require_finite(got.scene, "cut such frames out")
@@ -100,7 +103,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     how = "hold" if options.hands == "hold" else options.apart
     before = got.scene
     if options.shapes:
-        got = replace(got, scene=with_shapes(got.scene, shapes_of(options, got), got.body))
+        got = replace(got, scene=with_shapes(got.scene, shapes_of(options, how_lent, got), got.body))
     fixed = fixed_agents(got.scene, options.keep)
     if options.poses == "keep":
         refined = moved_apart(got.scene, got.body, APART[options.apart], fixed)
@@ -119,13 +122,17 @@ def main(arguments: Sequence[str] = ()) -> int:
     return 0
 
 
-def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
+def shapes_of(options: argparse.Namespace, how: Reading, got: Read) -> Tensor:
     """The shapes that --shapes says, for everybody. -> (B, P, 10)
+
+    how: its files are read, but for their length, which shapes do not have.
 
     Raises:
         CommandError: the file's people are too few, or its shapes are of another body.
     """
-    from magnet.export import formats
+    from dataclasses import replace
+
+    from magnet.export.reading import read
 
     scene = got.scene
     if options.shapes == ["exchange"]:
@@ -133,7 +140,10 @@ def shapes_of(options: argparse.Namespace, got: Read) -> Tensor:
             raise CommandError("--shapes exchange: expected two people or more, who are there in all scenes")
         return scene.betas.roll(1, dims=1)
     named = " ".join(options.shapes)
-    other = formats.read(options.shapes, options.body, formats.Reading(trim=True)).scene  # shapes have no length
+    lent = read(options.shapes, options.body, replace(how, trim=True, start=0, end=None))
+    for note in lent.notes:
+        print(f"--shapes: {note}")
+    other = lent.scene
     if other.body != scene.body:
         raise CommandError(f"--shapes {named}: its shapes are of body {other.body}, not of {scene.body}")
     betas = other.betas[0, other.present[0]]

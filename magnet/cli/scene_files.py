@@ -14,7 +14,7 @@ from magnet.cli.flags import PlainParser, help_topic
 
 if TYPE_CHECKING:
     from magnet.export.drawing import Size
-    from magnet.export.formats import Read, Reading
+    from magnet.export.reading import Read, Reading
     from magnet.motion.scene import Scene
 
 Options = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -79,12 +79,12 @@ def add_origin(options: Options) -> None:
 
 
 def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
-    """What `add_body` and `add_origin` were given, as readers take it."""
-    from magnet.export.formats import Reading
+    """What `add_body` and `add_origin` were given, as readers take it; not every command knows --trim."""
+    from magnet.export.reading import Reading
 
     return Reading(
         fps=fps,
-        trim=options.trim,
+        trim=getattr(options, "trim", False),
         unit=options.in_unit,
         up=options.up,
         joints=dict(pair.partition("=")[::2] for pair in options.joint),
@@ -194,10 +194,10 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
         CommandError: there are no scenes, or a file is named twice.
         ValueError: files that cannot be read; says what to do.
     """
-    from magnet.export import formats
+    from magnet.export.reading import read
 
     require_each_once(options.inputs)
-    got = formats.read(options.inputs, options.body, reading)
+    got = read(options.inputs, options.body, reading)
     for note in [*got.notes, *one_in_another(got.scene)]:
         print(note)
     if not got.scene.scenes:
@@ -228,14 +228,12 @@ def require_not_there(inputs: Sequence[str], outs: Sequence[str]) -> None:
     Raises:
         CommandError: says how to write either.
     """
-    from magnet.export import formats
+    from magnet.export.reading import READ
 
     first, *behind = outs
     known = {*map(Path, inputs)}  # what is read is refused by name
     there = [
-        out
-        for out in behind
-        if Path(out).suffix.lower() in formats.READ and Path(out).exists() and Path(out) not in known
+        out for out in behind if Path(out).suffix.lower() in READ and Path(out).exists() and Path(out) not in known
     ]
     # People and scenes may have got a file each.
     if not there or any(Path(first).parent.glob(f"{glob.escape(Path(first).stem)}*{Path(first).suffix}")):

@@ -7,12 +7,18 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from magnet.cli import scene_files
 from magnet.cli.flags import PlainParser
-from magnet.cli.scene_files import END, IN_FPS, START, require_files_to_cut
 from magnet.sampling.presets import PRESETS, preset_name
 
+if TYPE_CHECKING:
+    from magnet.export.reading import Reading
+
+GENERATE = ("ckpt_path", "task", "sampler", "steps", "seed")
+ONLY_LIVE, ONLY_RECORD, NOT_LIVE = ("people",), ("frames",), ("html", "truth", "context", "samples")
+"""Options of a model that generates, of both ways to let it, of either, and those of files that are only shown."""
 STEPS = 10
 """Denoising steps where nothing is said: quick enough to watch."""
 EXAMPLE = "duet"
@@ -44,13 +50,13 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--context", type=int, default=0, metavar="N", help=context)
     add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
-    add("--in_fps", **IN_FPS)
-    add("--start", **START)
-    add("--end", **END)
+    add("--start", **scene_files.START)
+    add("--end", **scene_files.END)
     styles = ("body", "light", "capsules", "skeleton")
     add("--style", choices=styles, help="default: body, light for crowds")
     add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
     add("--html", metavar="OUT.html", help="write a self-contained page that plays everything, and stop")
+    scene_files.add_origin(parser.add_argument_group("reading .bvh and .npz of other programs"))
     add = parser.add_argument_group("generating").add_argument
     add("--live", action="store_true", help="a model generates while you watch")
     record = "continue FILE once, keep the steps of its denoising, and watch these"
@@ -66,7 +72,9 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
     add("--host", default="127.0.0.1", help="0.0.0.0 lets other machines in (default: %(default)s)")
     add("--no_browser", action="store_true", help="only say where it is")
-    return parser.parse_intermixed_args(words)
+    options = parser.parse_intermixed_args(words)
+    options.said = {each.dest for each in parser._actions if getattr(options, each.dest, None) != each.default}
+    return options
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -118,7 +126,15 @@ def announce(port: int, host: str, quiet: bool) -> None:
 def _check(options: argparse.Namespace) -> None:
     if not options.files and not options.live:
         raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
-    require_files_to_cut(options.files, options.start, options.end)
+    for goes_with, names in (("--live or --record", GENERATE), ("--live", ONLY_LIVE), ("--record", ONLY_RECORD)):
+        chosen = (options.live and "--live" in goes_with) or (options.record is not None and "--record" in goes_with)
+        if not chosen and (name := next((name for name in names if name in options.said), None)):
+            raise ValueError(f"--{name}: goes with {goes_with}; leave it out, or add that")
+    if options.live and (name := next((name for name in NOT_LIVE if name in options.said), None)):
+        raise ValueError(f"--{name} goes with files that are shown, not with --live, which generates")
+    if options.live and options.files and options.people is not None:
+        raise ValueError("--people: --live goes on with the people of FILE; leave one of the two out")
+    scene_files.require_files_to_cut(options.files, options.start, options.end)
     if options.live and len(options.files) > 1:
         raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
     if options.record is not None and (options.live or len(options.files) != 1):
@@ -129,13 +145,23 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
 
 
+def _how_read(options: argparse.Namespace) -> tuple[Reading, Reading]:
+    """How FILEs and --truth are read."""
+    from magnet.export.reading import shared
+
+    files, truth = shared(
+        scene_files.reading(options), options.files, [options.truth] if options.truth else options.files
+    )
+    return files, truth
+
+
 def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.body.base import load_body
     from magnet.viewer.takes import read_takes
 
     body = load_body(options.body or "open")
-    part = options.in_fps, options.start, options.end
-    takes, body = read_takes(options.files, body, options.context, options.samples, *part)
+    how, _ = _how_read(options)
+    takes, body = read_takes(options.files, body, options.context, options.samples, how, print)
     longest = max(each.scene.frames for each in takes)
     if options.context > longest:
         raise ValueError(f"--context {options.context}: got {longest} frames, so at most {longest} were given")
@@ -148,8 +174,8 @@ def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
 
     if not options.truth:
         return None
-    part = options.in_fps, options.start, options.end
-    truth = read_takes([options.truth], body, 0, 1, *part)[0][0]
+    _, how = _how_read(options)
+    truth = read_takes([options.truth], body, 0, 1, how, lambda note: print(f"--truth: {note}"))[0][0]
     if abs(truth.scene.fps - fps) > 1e-3:
         raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
     return truth

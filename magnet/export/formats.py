@@ -1,15 +1,14 @@
-"""Scenes to and from files of every kind: a file's suffix says which."""
+"""Scenes written to files of every kind: a file's suffix says which."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnet.body import Body, load_body, on_floor
-from magnet.body.floor import counting, level, lowest, off_their_floor, standing
+from magnet.body import Body, load_body
 from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, paths_of, save_bvh
@@ -19,143 +18,17 @@ from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
-from magnet.export.npz_files import read_people
-from magnet.export.retarget import load_bvh, together
-from magnet.export.upright import WARNING
 from magnet.export.usd import require_usd, save_usd
-from magnet.files import regular
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, require_rotations
 
 if TYPE_CHECKING:
     from magnet.export.video import Report
 
-READ = (".npz", ".bvh")
 PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
 FILM = (640, 480)
 """Pixels of a film's panel."""
-UNSEEN = 0.0005
-"""Metres by which people are moved without a word."""
-
-
-@dataclass(frozen=True)
-class Read:
-    """A scene from files, the body its shapes belong to, and notes on how it was read."""
-
-    scene: Scene
-    body: Body
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Options for reading what files do not state.
-
-    Args:
-        fps: resample to this rate; None: as recorded.
-        trim: cut people of different lengths to the shortest.
-        unit: of lengths; None: of a BVH by the length of its legs, of an npz metres.
-        up: axis of the file that points up; None: found.
-        joints: for BVH: our joint's name to the file's, if no naming scheme fits.
-        keep_floor: keep people of other programs' files at the height they were recorded at.
-        in_fps: frames a second of npz files that do not say it.
-        start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
-    """
-
-    fps: float | None = None
-    trim: bool = False
-    unit: str | None = None
-    up: str | None = None
-    joints: Mapping[str, str] = field(default_factory=dict)
-    keep_floor: bool = False
-    in_fps: float | None = None
-    start: int = 0
-    end: int | None = None
-
-
-def read(
-    paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
-) -> Read:
-    """Read a scene from a Scene npz, SMPL-X npz files or BVH files; several files are several people.
-
-    Args:
-        body: the scene's body model, or its file; None: the open one.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: what cannot be read, or files that do not go together; says what to do.
-    """
-    files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-    options = options or Reading()
-    suffixes = {file.suffix.lower() for file in files}
-    if len(suffixes) != 1 or not suffixes <= set(READ):
-        names = ", ".join(file.name or str(file) for file in files) or "nothing"
-        also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
-        only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
-        raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind{only}")
-    for file in files:
-        if not file.exists():
-            raise FileNotFoundError(f"{file}: no such file")
-        regular(file)
-    body = body if isinstance(body, Body) else load_body("open" if body is None else body)
-    if options.in_fps is not None:
-        require_number("in_fps", options.in_fps, over=0)
-    if suffixes == {".bvh"}:
-        if options.in_fps is not None:
-            raise ValueError("in_fps: is for .npz files that say no frame rate; a .bvh says its own, --fps resamples")
-        bvh = {name: value for name, value in vars(options).items() if name != "in_fps"}
-        imported = load_bvh(files, body, **bvh)
-        notes = [str(source) for source in imported.sources]
-        if abs(imported.floor) >= UNSEEN:
-            way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
-            notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
-        return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
-    people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
-    scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
-    notes = [note for one in people for note in one.notes]
-    if len(scenes) == 1:
-        scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
-        return _grounded(scene, body, notes, () if options.keep_floor else foreign)
-    for file, scene in zip(files, scenes, strict=True):
-        if scene.scenes != 1:
-            raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
-    labels = [str(file) for file in files]
-    scene = together(scenes, labels, fps=options.fps, trim=options.trim)
-    return _grounded(scene, body, notes, () if options.keep_floor else foreign)
-
-
-def warned(notes: Sequence[str]) -> list[str]:
-    """The warnings among the notes of what was read, a line each."""
-    lines = [line.strip() for note in notes for line in note.splitlines()]
-    return [line.removeprefix(WARNING) for line in lines if line.startswith(WARNING)]
-
-
-def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[bool]) -> Read:
-    """Put the people of other programs' files onto the floor, which such files have at any height.
-
-    foreign: of each file, whether another program wrote it. Beside a file of ours, whose floor is known, people are
-    only moved where they are far from it; if there are none, nobody is.
-    """
-    if any(foreign) and (all(foreign) or level(scene, body)):
-        moved = on_floor(scene, body)
-        metres = float((scene.T_world_root - moved.T_world_root)[..., 1, 3].mean()) if scene.T_world_root.numel() else 0
-        if abs(metres) >= UNSEEN:
-            way = "lowered" if metres > 0 else "raised"
-            far = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
-            notes = [*notes, f"everybody was {way} by {far} onto the floor; --keep_floor leaves them"]
-        heights = standing(lowest(moved, body), counting(moved)).flatten().tolist() if moved.frames else []
-        notes = [*notes, *(off_their_floor(heights) if moved.scenes == 1 else [])]
-        return Read(moved, body, tuple(notes))
-    return Read(scene, body, (*notes, *_floor_note(scene, body)))
-
-
-def _floor_note(scene: Scene, body: Body) -> list[str]:
-    metres = level(scene, body)
-    if not metres:
-        return []
-    where = f"{abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where models have their floor"
-    return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
 
 
 @dataclass(frozen=True)

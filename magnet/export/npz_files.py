@@ -26,6 +26,19 @@ class NpzFile:
     up: str  # axis of the file
 
 
+def is_ours(path: Path) -> bool:
+    """Whether a file is a scene as we save it; not if it cannot be read."""
+    try:
+        with load_npz(path) as file:
+            return _ours(set(file.files))
+    except Exception:  # a damaged archive may raise anything, and whoever reads it says so
+        return False
+
+
+def _ours(keys: set[str]) -> bool:
+    return "meta" in keys and not posed(keys)
+
+
 def read_people(
     files: Sequence[Path],
     body: Body,
@@ -82,7 +95,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
             keys = set(file.files)
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    if "meta" in keys and not posed(keys):
+    if _ours(keys):
         if up not in (None, "y"):
             raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
         if unit not in (None, "m"):

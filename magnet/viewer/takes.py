@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from magnet.body.base import Body, load_body
-from magnet.export.formats import Reading, read
 from magnet.export.page.takes import SAMPLES, ShownTake, take, takes
+from magnet.export.reading import Reading, read, shared
 from magnet.export.trace import DenoisingTrace
 from magnet.files import load_npz
 from magnet.motion.scene import Scene
@@ -21,14 +21,13 @@ def read_takes(
     body: Body | None = None,
     context: int = 0,
     samples: int = SAMPLES,
-    in_fps: float | None = None,
-    start: int = 0,
-    end: int | None = None,
+    options: Reading | None = None,
+    say: Callable[[str], object] = lambda note: None,
 ) -> tuple[list[ShownTake], Body]:
     """The takes in several files, and their body.
 
-    body: the user's; by default the open one. in_fps: frames a second of npz files that do not say it. start, end: the
-    frames that are read, from 0, without `end`; None: to the last.
+    body: the user's; by default the open one. options: for reading; each file takes what suits its kind. say: is called
+    with every note on how a file was read.
 
     Raises:
         FileNotFoundError: no such file.
@@ -36,8 +35,11 @@ def read_takes(
     """
     body = body or load_body("open")
     found: list[tuple[Path, ShownTake]] = []
-    for path in map(Path, paths):
-        scene, recording = read_scene(path, body, in_fps, start, end)
+    hows = shared(options or Reading(), *([path] for path in paths))
+    for path, how in zip(map(Path, paths), hows, strict=True):
+        scene, recording, notes = read_scene(path, body, how)
+        for note in notes:
+            say(note if len(paths) == 1 or path.name in note else f"{path.name}: {note}")
         here = takes(scene, path.stem, context, samples)
         if recording is not None:
             here = [take(path.stem, scene, context, recording)]
@@ -51,12 +53,8 @@ def read_takes(
     return [each for _, each in found], body
 
 
-def read_scene(
-    path: Path, body: Body, in_fps: float | None = None, start: int = 0, end: int | None = None
-) -> tuple[Scene, DenoisingTrace | None]:
-    """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps.
-
-    in_fps, start, end: as for `read_takes`.
+def read_scene(path: Path, body: Body, options: Reading) -> tuple[Scene, DenoisingTrace | None, tuple[str, ...]]:
+    """A scene file, a SMPL-X npz, a BVH or a recording of denoising steps; and notes on how it was read.
 
     Raises:
         FileNotFoundError: no such file.
@@ -66,11 +64,15 @@ def read_scene(
         recording = DenoisingTrace.load(path)
         if recording.scene.body != body.id:
             raise ValueError(f"{path}: made for body {recording.scene.body!r}; give its file with --body MODEL.npz")
-        if start or end is not None:
-            raise ValueError(f"{path}: a recording of denoising is shown whole; leave out --start and --end")
-        return recording.scene, recording
+        if options != Reading():
+            raise ValueError(
+                f"{path}: a recording of denoising is shown whole and as it is; leave out --start, --end and what else "
+                "says how files are read"
+            )
+        return recording.scene, recording, ()
     try:
-        return read(path, body, Reading(in_fps=in_fps, start=start, end=end)).scene, None
+        got = read(path, body, options)
+        return got.scene, None, got.notes
     except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
 

@@ -12,7 +12,7 @@ from magnet.body import load_body
 from magnet.checkpoints import FOLDER
 from magnet.cli.predict_files import parser
 from magnet.denoiser.core import DenoiserCore
-from magnet.export import formats, save_bvh
+from magnet.export import reading, save_bvh
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.sampling.presets import PRESETS
@@ -313,7 +313,7 @@ def test_options_of_files_are_those_that_a_data_set_does_not_have() -> None:
 def test_files_may_stand_behind_options() -> None:
     from magnet.cli.predict_files import READ, meant
 
-    assert READ == formats.READ
+    assert READ == reading.READ
     assert meant(["--task", "joint_future", "a.bvh", "b.bvh", "--out", "c.glb"])
     assert meant(["--seed=3", "A.NPZ"]) and meant(["--trim", "a.bvh", "--out", "c.glb"])
     for words in (["--out", "a.npz", "b.npz"], ["--data.path", "a.npz"], ["--view", "--data.path", "a.npz"]):

@@ -164,6 +164,20 @@ def test_the_picture_leaves_out_frames_that_are_not_valid(crowded: Scene) -> Non
     assert [len(points.split()) for points in lines[:4]] == [8, 8, 8, 7]
 
 
+def _bones(path: Path) -> list[str]:
+    return re.findall(r"(?:ROOT|JOINT) (\w+)", path.read_text())
+
+
+def _renamed(path: Path) -> Path:
+    """The same skeleton with bones of names that say nothing."""
+    text = path.read_text()
+    for number, name in enumerate(_bones(path)):
+        text = re.sub(rf"\b{name}\b", f"Bone{number:02}", text)
+    strange = path.with_name(f"strange_{path.name}")
+    strange.write_text(text)
+    return strange
+
+
 def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = synthesize("handshake", 2, 120, torch.Generator().manual_seed(0), load_body()).scene.slice(40, 100)
     betas = torch.zeros(1, 2, 10)
@@ -180,6 +194,20 @@ def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsy
     assert cli.main(["refine", str(plain), str(out), "--shapes", *characters]) == 0
     sizes, wanted = (load_body().rest_joints(each[0])[:, 15, 1] for each in (Scene.load(out).betas, betas))
     assert torch.allclose(sizes, wanted, atol=0.02), "of other skeletons"
+    strange = [_renamed(Path(path)) for path in characters]
+    words = ["refine", str(plain), str(out), "--shapes", *map(str, strange)]
+    assert cli.main(words) != 0, "bones of unknown names"
+    told = [
+        word
+        for number, name in enumerate(_bones(Path(characters[0])))
+        for word in ("--joint", f"{name}=Bone{number:02}")
+    ]
+    capsys.readouterr()
+    assert cli.main([*words, *told, "--in_unit", "m", "--up", "y"]) == 0, "IN, a scene of magnet, takes none of these"
+    assert "--shapes: " in capsys.readouterr().out
+    assert torch.allclose(load_body().rest_joints(Scene.load(out).betas[0])[:, 15, 1], wanted, atol=0.02)
+    assert cli.main(["refine", str(plain), str(out), "--in_unit", "cm"]) != 0, "but alone"
+    assert cli.main(["refine", str(plain), str(out), *told[:2]]) != 0, "but alone"
     second = (
         scene.pad_agents(3).permute_agents(torch.tensor([2, 1, 0])).save(tmp_path / "second.npz")
     )  # a free slot first

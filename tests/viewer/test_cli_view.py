@@ -1,13 +1,17 @@
 """What `magnet view` says when something is wrong."""
 
 import builtins
+import re
 import socket
 from pathlib import Path
 
 import pytest
+import torch
 
+from magnet.body import Body
 from magnet.cli import main, view
 from magnet.cli.view import arguments_of, sampler_options
+from magnet.export import save_bvh
 from magnet.export.page.rig import VIEWS
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
@@ -58,6 +62,42 @@ def test_nothing_to_watch_and_contradictions_are_named(capsys) -> None:
     assert "one scene" in said(capsys, "--live", "a.npz", "b.npz")
     assert "--record" in said(capsys, "--live", "--record", "x.npz")
     assert "--samples 0" in said(capsys, "a.npz", "--samples", "0")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("a.npz --people 2", "--people: goes with --live"),
+        ("a.npz --task inbetweening", "--task: goes with --live or --record"),
+        ("a.npz --steps 4", "--steps: goes with --live or --record"),
+        ("a.npz --seed 7 --html a.html", "--seed: goes with --live or --record"),
+        ("a.npz --record b.npz --people 2", "--people: goes with --live"),
+        ("--live --frames 32", "--frames: goes with --record"),
+        ("--live --html a.html", "--html goes with files that are shown"),
+        ("--live a.npz --truth b.npz", "--truth goes with files that are shown"),
+        ("--live a.npz --people 3", "--people: --live goes on with the people of FILE"),
+    ],
+)
+def test_options_that_would_not_be_heard_are_refused(words: str, message: str, capsys) -> None:
+    assert message in said(capsys, *words.split())
+
+
+def test_files_of_other_programs_are_read_as_is_said_and_notes_are_printed(
+    tmp_path: Path, duet: Scene, body: Body, capsys
+) -> None:
+    (rig,) = save_bvh(duet.permute_agents(torch.tensor([0])), tmp_path / "rig.bvh", body)
+    strange = tmp_path / "strange.bvh"
+    text, told = rig.read_text(), []
+    for number, (ours, theirs) in enumerate(re.findall(r"(?:ROOT|JOINT) ((\w+))", text)):
+        text = re.sub(rf"\b{theirs}\b", f"Bone{number:02}", text)
+        told += ["--joint", f"{ours}=Bone{number:02}"]
+    strange.write_text(text)
+    known = duet.save(tmp_path / "known.npz")
+    page = ["--html", str(tmp_path / "a.html"), "--style", "skeleton"]
+    assert "--joint" in said(capsys, str(strange), *page)
+    words = [str(strange), "--truth", str(known), "--up", "y", "--in_unit", "m", *told, *page]
+    assert main(["view", *words]) == 0, "the scene of magnet takes none of these, and needs none"
+    assert "strange.bvh" in capsys.readouterr().out
 
 
 def test_an_unreadable_file_is_named(tmp_path: Path, capsys) -> None:

@@ -10,6 +10,7 @@ import torch
 from magnet.body import Body
 from magnet.export.npz import save_smplx
 from magnet.export.page.takes import same_length, take, takes
+from magnet.export.reading import Reading
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from magnet.viewer.takes import read_takes
@@ -26,7 +27,7 @@ def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path,
 
 def test_a_part_of_a_file_is_shown(tmp_path: Path, duet: Scene, body: Body) -> None:
     path = duet.save(tmp_path / "dance.npz")
-    found, _ = read_takes([path], body, start=2, end=6)
+    found, _ = read_takes([path], body, options=Reading(start=2, end=6))
     assert torch.equal(found[0].scene.T_world_root, duet.slice(2, 6).T_world_root)
 
 
