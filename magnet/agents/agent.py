@@ -13,6 +13,7 @@ from torch import Tensor
 from magnet.agents.message import JOINTS, LONGEST, POSE, TOKEN, Message
 from magnet.agents.rollout import OwnRollout
 from magnet.denoiser.core import DenoiserCore
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.motion.frames import rigid
 from magnet.motion.required import require_one, require_rate
 from magnet.motion.rotations import from_quat, to_quat
@@ -151,7 +152,7 @@ class Agent(Notebook):
     """An agent that generates its own motion.
 
     Args:
-        model: the trained denoiser.
+        model: the trained denoiser, or what `magnet.load` returns, whose sampler is not read.
         start: see `Notebook`.
         names: see `Notebook`.
         me: see `Notebook`.
@@ -162,7 +163,7 @@ class Agent(Notebook):
 
     def __init__(
         self,
-        model: DenoiserCore,
+        model: DenoiserCore | Loaded,
         start: Scene,
         names: Sequence[str],
         me: str,
@@ -171,12 +172,12 @@ class Agent(Notebook):
         seed: int = 0,
     ) -> None:
         super().__init__(start, names, me)
-        self.model, self.task, self.options, self.seed = model, task, options, seed
+        self.model, self.task, self.options, self.seed = denoiser_of(model), task, options, seed
         order = task.order if isinstance(task, AgenticAsync) else ()
         turns = [*order, *(slot for slot in range(len(names)) if slot not in order)]
         in_turns = isinstance(task, AgenticAsync)
         self._before = {slot for slot in self.others() if in_turns and turns.index(slot) < turns.index(self.me)}
-        self.print = fingerprint(model)
+        self.print = fingerprint(self.model)
         self._wanted: set[tuple[int, int]] = set()
         self.begin()
 

@@ -82,10 +82,13 @@ class PlainParser(argparse.ArgumentParser):
             f"magnet {command}", description=description, epilog=epilog, formatter_class=how, allow_abbrev=False
         )
         self.command = command
+        self.elsewhere: dict[str, str] = {}  # options of other commands, and what is to be done instead
 
     def error(self, message: str) -> NoReturn:
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)
-        hint = closest(unknown[1].partition("=")[0], list(self._option_string_actions)) if unknown else ""
+        name = unknown[1].partition("=")[0] if unknown else ""
+        hint = closest(name, list(self._option_string_actions)) if unknown else ""
+        hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
         several = [
             action.option_strings[0] for action in self._actions if action.option_strings and action.nargs == "+"
         ]

@@ -45,6 +45,21 @@ without files, people or this help's name, magnet predict samples a data set: ma
 """
 
 
+OF_EXPORT = (
+    "--fps",
+    "--names",
+    "--root",
+    "--clips",
+    "--unit",
+    "--smplx",
+    "--each",
+    "--on_floor",
+    "--person",
+    "--title",
+)
+"""Options of `magnet export`, which writes what was predicted in other ways."""
+
+
 def meant(arguments: Sequence[str]) -> bool:
     """Whether a command line after `predict` is about files, or about people from nothing, and not about a data set."""
     first = arguments[0] if arguments else ""
@@ -70,6 +85,7 @@ def _names_files(arguments: Sequence[str]) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("predict", __doc__, EPILOG, inputs="*")
+    options.elsewhere = dict.fromkeys(OF_EXPORT, "magnet export chooses it: write an .npz, then export that")
     options.add_argument("--out", nargs="+", action="extend", **scene_files.OUT)
     add = options.add_argument_group("what is sampled").add_argument
     add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
@@ -245,6 +261,11 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
         groups = [start_of_crowd(options, scene)] if options.inputs else []
         options.context = options.context or (groups[0].frames if groups else CONTEXT)
         return model.start_crowd(people, groups, model.sampler.crowd_spacing, seed=options.seed), ()
+    if options.spacing is not None:
+        raise CommandError(
+            f"--spacing {options.spacing:g}: places the groups of a crowd, which begins above {model.most_people} "
+            "people; leave it out"
+        )
     added = tuple(range(scene.agents, people))
     scene = scene.pad_agents(people)
     present = scene.present.clone()

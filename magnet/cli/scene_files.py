@@ -26,7 +26,7 @@ OF_FILES = (
 """Options of `magnet predict` that go with files, or with people from nothing, and not with a data set."""
 
 
-def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> argparse.ArgumentParser:
+def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> PlainParser:
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
     options.add_argument("inputs", nargs=inputs, metavar="IN", help="a .npz or .bvh file; several are several people")

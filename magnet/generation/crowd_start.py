@@ -10,6 +10,7 @@ from torch import Tensor
 
 from magnet.checks import require_number, require_whole
 from magnet.denoiser.core import DenoiserCore
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_agents, empty_scene
@@ -31,7 +32,7 @@ SHAPES = 0.7
 
 
 def start_crowd(
-    model: DenoiserCore,
+    model: DenoiserCore | Loaded,
     people: int,
     options: SamplerOptions | None = None,
     generator: torch.Generator | None = None,
@@ -56,6 +57,7 @@ def start_crowd(
         ValueError: nobody, or more people than `MOST`.
     """
     require_whole("people", people, 1, MOST)
+    model = denoiser_of(model)
     turns = torch.Generator()
     turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
     if not groups:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 
 from magnet.denoiser.core import DenoiserCore
+from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.options import SamplerOptions
@@ -29,7 +30,7 @@ Plan = Iterator[PlannedStage]
 
 
 def plan_of_scene(
-    model: DenoiserCore, task: Task, agents: int, context: int, frames: int, options: SamplerOptions
+    model: DenoiserCore | Loaded, task: Task, agents: int, context: int, frames: int, options: SamplerOptions
 ) -> MaskSchedule:
     """What a task knows and makes of a scene, and in which order, where this model samples it with these options.
 
@@ -42,6 +43,7 @@ def plan_of_scene(
         ValueError: the task makes no sense at these sizes.
     """
     tokens = -(-(context + frames) // TOKEN_FRAMES)
+    model = denoiser_of(model)
     options = options.filled(model.sampling)
     return schedule_of(task, planning_grid(tokens, agents, context // TOKEN_FRAMES, model.window, options))
 
