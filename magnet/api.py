@@ -32,6 +32,7 @@ from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.base import Task
+from magnet.tasks.inbetweening import Inbetweening
 
 __all__ = ["Model", "Motion", "NotebookView", "load", "read"]
 
@@ -314,6 +315,9 @@ class Model:
         if bool((bad := given_invalid(plain, plan.known)).any()):
             first = int(bad.nonzero()[0])
             warnings.warn(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid", stacklevel=2)
+        named = chosen.named(len(plan.known)) if isinstance(chosen, Inbetweening) else []
+        if within := [step for step in named if 0 <= step * TOKEN_FRAMES < context]:
+            warnings.warn(f"context={context}: in it lie the keyframes at token steps {within}", stacklevel=2)
         made = self.sample(scene, chosen, context, frames, seed=seed, samples=samples, cond=cond)
         return Motion.of(completed(made.plain(), plain.to("cpu"), ~plan.finished), body)
 

@@ -180,6 +180,11 @@ def test_given_frames_that_are_not_valid_are_warned_of(model: Model, duet: Scene
         model.predict(duet.replace(valid=valid), "joint_future", context=16, frames=8, seed=1)
 
 
+def test_keyframes_that_lie_in_the_context_are_warned_of(model: Model, duet: Scene):
+    with pytest.warns(UserWarning, match=r"context=16: in it lie the keyframes at token steps \[3\]"):
+        model.predict(duet, "inbetweening", context=16, seed=1, keys=(3, -1))
+
+
 def test_fields_of_a_task_are_handed_on(model: Model, duet: Scene):
     motion = model.predict(duet, "partner_prediction", context=16, frames=8, seed=1, target=(1,))
     assert motion.given is not None and not motion.given[:, 16:, 1].any()

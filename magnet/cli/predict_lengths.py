@@ -125,10 +125,7 @@ def keys_of(task: Task, recorded: int) -> list[int]:
     from magnet.motion.tokens import TOKEN_FRAMES
     from magnet.tasks.inbetweening import Inbetweening
 
-    if not isinstance(task, Inbetweening):
-        return []
-    named, last = {*task.keys, *(step for _, step in task.pairs)}, recorded // TOKEN_FRAMES
-    return sorted(step + last if step < 0 else step for step in named)
+    return task.named(recorded // TOKEN_FRAMES) if isinstance(task, Inbetweening) else []
 
 
 def require_recorded(task: str, context: int, recorded: int, known: Tensor, crowd: bool) -> None:

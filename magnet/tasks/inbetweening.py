@@ -41,6 +41,11 @@ class Inbetweening:
             known[step, agent] = True
         return toward_keys(known, grid)
 
+    def named(self, tokens: int) -> list[int]:
+        """Token steps of the keyframes that `keys` and `pairs` name, in a scene of so many token steps."""
+        steps = {*self.keys, *(step for _, step in self.pairs)}
+        return sorted(step + tokens if step < 0 else step for step in steps)
+
     def _keyframes(self, grid: Grid) -> Iterator[tuple[int, int]]:
         """All keyframes as (agent, token step).
 
