@@ -60,6 +60,10 @@ OF_EXPORT = (
 """Options of `magnet export`, which writes what was predicted in other ways."""
 
 
+COUNTS = {"frames": (1, 1_000_000), "context": (0, 1_000_000), "samples": (1, 10_000)}
+"""The least and the most that is taken; more, nine hours of motion, is a slip."""
+
+
 def meant(arguments: Sequence[str]) -> bool:
     """Whether a command line after `predict` is about files, or about people from nothing, and not about a data set."""
     first = arguments[0] if arguments else ""
@@ -180,10 +184,10 @@ def require_counts(options: argparse.Namespace) -> None:
     Raises:
         CommandError: names the option.
     """
-    for name, least in (("frames", 1), ("context", 0), ("samples", 1)):
+    for name, (least, most) in COUNTS.items():
         value = getattr(options, name)
-        if value is not None and value < least:
-            raise CommandError(f"--{name} {value}: expected at least {least}")
+        if value is not None and not least <= value <= most:
+            raise CommandError(f"--{name} {value}: expected {least} to {most:,}")
 
 
 def require_files(paths: Sequence[str]) -> None:

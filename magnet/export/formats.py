@@ -29,6 +29,8 @@ PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
 FILM = (640, 480)
 """Pixels of a film's panel."""
+MOST_FPS = 1000.0
+"""Frames a second that are written at most; more is a slip, and would fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ def write(
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
     if fps is not None:
-        require_number("fps", fps, over=0)
+        require_number("fps", fps, over=0, most=MOST_FPS)
     if apart or not kind.nan:
         require_finite(scene)
     rate = scene.fps if fps is None else fps

@@ -109,10 +109,16 @@ class _Hierarchy:
         if key == "ROOT" and self.joints:
             raise ValueError(f"{where}: a second ROOT; write each person to a BVH file of their own")
         if key != "ROOT" and not self.open:
-            raise ValueError(f"{where}: a {'JOINT' if key == 'JOINT' else 'End Site'} outside the ROOT")
+            raise ValueError(f"{where}: {_said(key)} outside the ROOT")
+        if self.open and self.joints[self.open[-1]].end:
+            raise ValueError(f"{where}: {_said(key)} inside an End Site, where nothing can be; is a line lost?")
         end = key == "END"
         parent = self.open[-1] if self.open else -1
         self.joints.append(BvhJoint("" if end else name or f"joint{len(self.joints)}", parent, end))
+
+
+def _said(key: str) -> str:
+    return {"ROOT": "a ROOT", "JOINT": "a JOINT"}.get(key, "an End Site")
 
 
 def parse_hierarchy(path: object, lines: Sequence[str]) -> list[BvhJoint]:

@@ -32,6 +32,10 @@ def require_spacing(spacing: str, shift: float) -> None:
         )
 
 
+MOST_WEIGHT, MOST_BLEND = 1e6, 1_000_000
+"""Of a pairwise transform and frames of a blend: beyond, numbers overflow."""
+
+
 @dataclass(frozen=True)
 class SamplerOptions:
     """How scenes are sampled.
@@ -147,8 +151,8 @@ class SamplerOptions:
         for name in ("pyramid_offset", "opening"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 0)
-        require_number("pairwise_weight", self.pairwise_weight, least=0)
-        require_whole("blend", self.blend, 0)
+        require_number("pairwise_weight", self.pairwise_weight, 0, MOST_WEIGHT)
+        require_whole("blend", self.blend, 0, MOST_BLEND)
         require_number("crowd_enter", self.crowd_enter, over=0)
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
         require_number("crowd_spacing", self.crowd_spacing, over=0)

@@ -164,6 +164,7 @@ BREAKS = {
     "something that is no number": lambda text: re.sub(r"\S+\n$", "1.2.3\n", text),
     r":5: CHANNELS 6 X .*: expected 6 of": lambda text: text.replace("CHANNELS 6 Xposition", "CHANNELS 6 X", 1),
     r":4: got 0.0 0.0, expected 3 finite": lambda text: re.sub(r"OFFSET [0. ]+", "OFFSET 0.0 0.0", text, count=1),
+    "a JOINT inside an End Site": lambda text: re.sub(r"(End Site\s*{)", r"\1\nJOINT a\n{\nOFFSET 0 0 0\n}", text),
     "a second ROOT": lambda text: text.replace("JOINT left_hip", "ROOT left_hip"),
     "expected ROOT, JOINT": lambda text: text.replace("JOINT left_hip", "BONE left_hip"),
     "frames of 0 s": lambda text: re.sub(r"Frame Time: \S+", "Frame Time: 0", text),

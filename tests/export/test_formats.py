@@ -121,6 +121,11 @@ def test_what_cannot_be_written_is_named(duet: Scene, body: Body, tmp_path: Path
         formats.write(duet, tmp_path / "a.obj", body)
 
 
+def test_a_rate_that_would_fill_the_memory_is_refused(duet: Scene, tmp_path: Path):
+    with pytest.raises(ValueError, match=r"fps: got 1e\+09, expected over 0 and at most 1000"):
+        formats.write(duet, tmp_path / "a.glb", fps=1e9)
+
+
 def test_the_open_body_is_the_default(duet: Scene, tmp_path: Path):
     (path,) = formats.write(duet, tmp_path / "a.glb")
     assert path.read_bytes() == formats.write(duet, tmp_path / "b.glb", load_body("open"))[0].read_bytes()
