@@ -21,7 +21,7 @@ from magnet.evaluation.by_scene import in_each_scene, of_all_processes, scene_va
 from magnet.evaluation.results import Results
 from magnet.generation.conditioning import occupied
 from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
-from magnet.metrics.guarded import lost_numbers
+from magnet.metrics.guarded import lost_numbers, warn_of_unreal
 from magnet.metrics.interval import Unit, independent_units
 from magnet.metrics.registry import MEMORISATION, stems
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
@@ -287,6 +287,7 @@ class Scoring:
             row = rows.get(name, {})
             rows[name] = {key: value for key, value in row.items() if beside(key, columns) not in without}
         rows = {name: row for name, row in rows.items() if row}
+        warn_of_unreal(self.metrics, rows)
         seconds = {name: round(value, 2) for name, value in self.seconds.items()}
         scenes = scene_values(of_all_processes(found), rows)
         return Results(rows, facts | {"seconds": seconds}, columns, scenes)

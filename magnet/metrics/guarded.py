@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 from functools import cache
 from types import new_class
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torchmetrics import MetricCollection
+from torchmetrics.utilities import rank_zero_warn
 
 from magnet.metrics.base import MotionMetric
 from magnet.plugins import attempted, told
@@ -25,12 +26,14 @@ class Guarded(MotionMetric):
         name, origin: of the metric and its package, for the warning.
         taken: names that no number of it may have.
         lost: after `compute`, whether it failed in this or another process.
+        unreal: after `compute`, those of its numbers that are NaN or infinite.
     """
 
     failures: Tensor  # summed over processes, so that all of them leave out the same
     name = origin = ""
     taken: frozenset[str] = frozenset()
     lost = False
+    unreal: Mapping[str, float] = {}
 
     def start_guard(self, name: str, origin: str, taken: Iterable[str]) -> None:
         """Count failures from now on, once the metric has been made."""
@@ -49,6 +52,7 @@ class Guarded(MotionMetric):
         compute: Callable[[], Any] = super().compute  # type: ignore[safe-super]  # the stranger's
         numbers: dict[str, Tensor] = {}
         self.lost = bool(self.failures) or not self._well(lambda: numbers.update(_scalars(compute(), self.taken)))
+        self.unreal = {name: float(value) for name, value in numbers.items() if not bool(value.isfinite())}
         return {} if self.lost else numbers
 
     def _well(self, call: Callable[[], object]) -> bool:
@@ -93,3 +97,27 @@ def lost_numbers(collections: Iterable[MetricCollection]) -> set[str]:
     """Columns whose metric failed in one of the collections, after `compute` of all; no row is to show them."""
     every = [metric for each in collections for metric in each.values()]
     return {name for metric in every if isinstance(metric, Guarded) and metric.lost for name in metric.columns}
+
+
+def warn_of_unreal(metrics: Mapping[str, MetricCollection], rows: Mapping[str, Container[str]]) -> None:
+    """Warn of each metric that gave NaN or an infinity over all scenes, after `compute` of all.
+
+    Args:
+        metrics: by the name of their row.
+        rows: the numbers that each row shows.
+    """
+    found: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
+    for row, collection in metrics.items():
+        for metric in collection.values():
+            if isinstance(metric, Guarded):
+                shown = {name: value for name, value in metric.unreal.items() if name in rows.get(row, ())}
+                ends = {name + end for name in shown for end in ("_low", "_high")}  # of its interval
+                numbers = [(str(value), name, row) for name, value in shown.items() if name not in ends]
+                found.setdefault((metric.name, metric.origin), []).extend(numbers)
+    for (name, origin), numbers in found.items():
+        if numbers:
+            gave, of, where = (", ".join(dict.fromkeys(part)) for part in zip(*numbers, strict=True))
+            rank_zero_warn(
+                f"metric {name} gave {gave} over all scenes: {of} in {where}; results.json holds null there "
+                f"(of {origin})"
+            )

@@ -119,6 +119,26 @@ def test_a_strangers_metric_that_fails_for_one_row_is_left_out_of_all_and_nothin
     assert {name: set(row) for name, row in rows.items()} == {name: set(row) for name, row in measured.rows.items()}
 
 
+class Unreal(Divergence):
+    """NaN of samples, infinite of recordings, each in one number."""
+
+    def measure(self, futures):
+        (total, count), *others = super().measure(futures)
+        return [(total * (math.inf if self.of == "truth" else math.nan), count), *others]
+
+
+def test_a_strangers_metric_that_is_no_number_over_all_scenes_is_named(monkeypatch):
+    monkeypatch.setattr(METRICS, "discovered", True)
+    monkeypatch.setattr(METRICS, "known", {"theirs": Registered("theirs", Unreal, "their-package 1.0")})
+    with pytest.warns(UserWarning, match="metric theirs") as warned:
+        rows = run(data(), baselines=False).results.rows
+    assert math.isnan(rows[MODEL]["divergence"]) and math.isinf(rows[TRUTH]["divergence"])
+    assert [str(each.message) for each in warned if "metric" in str(each.message)] == [
+        "metric theirs gave nan, inf over all scenes: divergence in magnet, ground truth; results.json holds null "
+        "there (of their-package 1.0)"
+    ]
+
+
 def test_a_training_stretch_met_again_is_found_by_nearest_neighbour():
     clips = [random_clip("a", 120, 2, split=split) for split in ("train", "test")]
     rows = run(data(clips)).results.rows
