@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import astuple, fields
 from typing import Any
 
 import lightning as L
@@ -151,7 +152,7 @@ class Evaluator(L.LightningModule):
     def finish(self) -> dict[str, Tensor]:
         """Finish the run and put the table into `results`. Returns what to log, the model's metrics first."""
         assert self.scoring is not None
-        self.results = self.scoring.finish(self.facts())
+        self.results = self.scoring.finish(self._facts(*self._of_all_processes()))
         return {f"test/{name}": torch.tensor(value) for name, value in self.results.rows[self.row].items()}
 
     def schedule(self, context: int, horizon: int, slots: int | None = None) -> MaskSchedule:
@@ -206,7 +207,20 @@ class Evaluator(L.LightningModule):
     # -- what was done -------------------------------------------------------------------------
 
     def facts(self) -> dict[str, Any]:
-        """What has been sampled, how, and what it cost; JSON-ready."""
+        """What this process has sampled, how, and what it cost; JSON-ready. `results` has those of all processes."""
+        return self._facts(self.scenes, self.stats)
+
+    def _of_all_processes(self) -> tuple[int, SamplingStats]:
+        """Scenes and statistics of this run, summed over its processes, all of which must call it."""
+        trainer = self._trainer
+        if trainer is None or trainer.world_size == 1:
+            return self.scenes, self.stats
+        own = torch.tensor([self.scenes, *astuple(self.stats)], dtype=torch.float64)
+        scenes, *sums = trainer.strategy.reduce(own.to(trainer.strategy.root_device), reduce_op="sum").tolist()
+        names = (field.name for field in fields(SamplingStats))
+        return round(scenes), SamplingStats(**dict(zip(names, sums, strict=True)))
+
+    def _facts(self, scenes: int, stats: SamplingStats) -> dict[str, Any]:
         units = 0 if self.scoring is None else len(set(self.scoring.unit_of.values()))
         return {
             "task": type(self.task).__name__,
@@ -214,12 +228,12 @@ class Evaluator(L.LightningModule):
             "samples": self.samples,
             "seed": self.seed,
             "sampler": repr(self.sampler.filled(self.denoiser.sampling)),
-            "test scenes": self.scenes,
+            "test scenes": scenes,
             "context frames": self.context,
             "horizon frames": self.horizon,
             "device": str(self.denoiser.device),
             "intervals": {"level": CONFIDENCE, "by": self.interval, "units": units},
-            "sampling": {name: round(value, 4) for name, value in self.stats.means().items()},
+            "sampling": {name: round(value, 4) for name, value in stats.means().items()},
         }
 
     def _numbers(self, scenes: int) -> list[int]:
