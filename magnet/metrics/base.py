@@ -66,8 +66,8 @@ class MotionMetric(Metric):
 
         `units` (B,) int says which clips are not independent of each other, see `bootstrap_interval`.
         """
-        if self.of == "truth":
-            generated = truth[None]
+        if self.of == "truth" and getattr(generated, "ndim", 0) == 6:  # else `Futures.of` refuses it
+            generated = truth[None, :, : generated.shape[2]]  # the frames that other rows are measured over
         if present is None:
             present = torch.ones(truth.shape[0], truth.shape[2], dtype=torch.bool, device=truth.device)
         self.add(Futures.of(generated, truth, present, self.agents if agents is None else agents, units))

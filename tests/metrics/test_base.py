@@ -99,6 +99,15 @@ def test_ground_truths_row_does_not_read_what_was_generated() -> None:
         assert float(got[name]) == pytest.approx(float(value), abs=1e-12)
 
 
+def test_ground_truths_row_is_over_the_frames_that_were_sampled() -> None:
+    generated, truth, present = draw_batch()
+    short, cut = ground_truth_metrics(), ground_truth_metrics()
+    agents = torch.ones(16, 3, dtype=torch.bool)
+    short.update(generated[:, :, :16], truth, present, agents=agents)
+    cut.update(truth[None, :, :16], truth[:, :16], present, agents=agents)
+    assert short.compute() == cut.compute()
+
+
 def test_all_metrics_have_names_of_their_own_and_may_score_one_agent() -> None:
     batch = draw_batch()
     collection = all_metrics(scored=ONLY_SECOND)
