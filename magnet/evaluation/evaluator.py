@@ -98,6 +98,18 @@ class Evaluator(L.LightningModule):
     # -- what the Trainer calls ----------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
+        """Refuse what cannot be sampled.
+
+        Raises:
+            ValueError: data that say no context and horizon, or a precision that scenes do not survive.
+        """
+        data = getattr(self.trainer, "datamodule", None)
+        if not isinstance(data, MotionDataModule):
+            got = "no data module" if data is None else f"{type(data).__module__}.{type(data).__qualname__}"
+            raise ValueError(
+                f"data: got {got}, expected a MotionDataModule, whose test scenes have a context and a horizon; "
+                "see docs/own.md"
+            )
         self.denoiser.require_tokenizer()
         require_float32_scenes(self.trainer.precision)
 

@@ -282,6 +282,23 @@ def test_a_context_of_broken_tokens_is_refused():
         run(datamodule)
 
 
+class Foreign(L.LightningDataModule):
+    def test_dataloader(self):
+        return torch.utils.data.DataLoader(torch.zeros(4, 2))
+
+    predict_dataloader = test_dataloader
+
+
+@pytest.mark.parametrize("what", ["test", "predict"])
+@pytest.mark.parametrize("named", [True, False])
+def test_data_without_context_and_horizon_are_refused(what, named):
+    evaluation, trainer = prepared(baselines=False)
+    given = {"datamodule": Foreign()} if named else {"dataloaders": Foreign().test_dataloader()}
+    got = r"\S+\.Foreign" if named else "no data module"
+    with pytest.raises(ValueError, match=f"data: got {got}, expected a MotionDataModule, .* see docs/own.md"):
+        getattr(trainer, what)(evaluation, **given)
+
+
 @pytest.mark.parametrize("name", ["samples", "baseline_stride"])
 def test_no_samples_and_no_stride_are_refused(name):
     with pytest.raises(ValueError, match=f"{name}: got 0, expected at least 1"):
