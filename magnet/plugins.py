@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -68,21 +69,37 @@ class Registry:
         for module in self.modules:
             importlib.import_module(module)
         for point in entry_points(group=self.group):
-            self.load(point.name, point.load, f"{point.dist.name} {point.dist.version}" if point.dist else point.value)
+            origin = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
+            names = self.load(point.name, point.load, origin)
+            if names and point.name not in names:
+                self._warn(point.name, origin, f"names a class that is registered already: use {' or '.join(names)}")
+        for name, error in self.failed.items():
+            if (known := self.known.get(name)) is not None:  # which is what the name gives, without a word
+                self._warn(name, self.failed_of[name], f"is not used, {name} is of {known.origin}: {told(error)}")
         return True
 
-    def load(self, name: str, load: Callable[[], type], origin: str) -> None:
-        """Load a plug-in. Its class may have registered itself with a decorator, which does not know the origin."""
+    def _warn(self, name: str, origin: str, what: str) -> None:
+        warnings.warn(f"entry point {name} of {self.group} ({origin}) {what}", stacklevel=3)
+
+    def load(self, name: str, load: Callable[[], type], origin: str) -> list[str]:
+        """Load a plug-in. Its class may have registered itself with a decorator, which does not know the origin.
+
+        Returns:
+            The names under which it is known; none where it failed.
+        """
+        names: list[str] = []
 
         def loaded() -> None:
             kind = load()
             self.check(name, kind)
-            own = [entry.name for entry in self.known.values() if entry.kind is kind]
-            for each in own or [name]:
+            own = [entry.name for entry in self.known.values() if entry.kind is kind] or [name]
+            for each in own:
                 self.add(each, kind, origin)
+            names.extend(own)
 
         if (error := attempted(loaded)) is not None:
             self.fail(name, error, origin)
+        return names
 
     def fail(self, name: str, error: BaseException, origin: str) -> None:
         """Note why a plug-in is not there, and which package brings it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import pytest
@@ -54,6 +55,55 @@ def test_one_that_fails_is_left_out_with_its_reason(
     with pytest.raises(ValueError) as caught:
         registry.require_loaded("bad")
     assert str(caught.value) == f"thing Bad failed to load: {said}"
+
+
+def warnings_of(registry: plugins.Registry) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        registry.discover()
+    return [str(each.message) for each in caught]
+
+
+def test_a_class_under_two_names_is_said_to_have_the_first(offered: tuple[plugins.Registry, list[Point]]) -> None:
+    registry, points = offered
+    points += [Point("first", lambda: int), Point("second", lambda: int)]
+    said = "entry point second of some.things (of_second:Thing) names a class that is registered already: use first"
+    assert warnings_of(registry) == [said] and set(registry.known) == {"first"}
+
+
+def test_a_class_that_registers_itself_under_another_name_is_said_to_have_that(
+    offered: tuple[plugins.Registry, list[Point]],
+) -> None:
+    registry, points = offered
+
+    def decorated() -> type:
+        registry.add("own", int, "magnet")
+        return int
+
+    points.append(Point("other", decorated))
+    (said,) = warnings_of(registry)
+    assert said.endswith("(of_other:Thing) names a class that is registered already: use own")
+    assert registry.known["own"].origin == "of_other:Thing"
+
+
+@pytest.mark.parametrize("bad_first", [True, False])
+def test_one_whose_name_is_taken_is_said_to_be_unused_and_why(
+    offered: tuple[plugins.Registry, list[Point]], bad_first: bool
+) -> None:
+    registry, points = offered
+    bad = Point("same", raising(ImportError("no shoes")))
+    points += [bad, Point("same", lambda: int)] if bad_first else [Point("same", lambda: int), bad]
+    (said,) = warnings_of(registry)
+    assert said.startswith("entry point same of some.things (of_same:Thing) is not used, same is of ")
+    assert said.endswith(": ImportError: no shoes")
+
+
+def test_a_taken_name_is_told_with_who_has_it(offered: tuple[plugins.Registry, list[Point]]) -> None:
+    registry, points = offered
+    registry.add("mine", str, "magnet")
+    points += [Point("mine", lambda: int), Point("good", lambda: float)]
+    (said,) = warnings_of(registry)
+    assert "is not used, mine is of magnet: ValueError: thing name mine is taken by builtins.str" in said
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), Stopped(143)])

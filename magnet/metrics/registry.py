@@ -76,7 +76,8 @@ def other_metrics(
         TAKEN.update(known, columns_of(*known.values()), [MEMORISATION], NearestTraining.columns)
         METRICS.discover()
         for name, error in METRICS.failed.items():
-            _warn(name, METRICS.failed_of[name], "failed to load", error)
+            if name not in METRICS.known:  # else the registry has warned
+                _warn(name, METRICS.failed_of[name], "failed to load", error)
     made: dict[str, Metric] = {}
     for name, each in sorted(METRICS.known.items()):
         words: dict[str, Any] = {"of": of, "agents": agents, "fps": fps}
