@@ -13,6 +13,9 @@ from pathlib import Path
 
 from magnet.errors import Stopped
 
+VERSIONS: dict[str, str] = {}
+"""Of the installed packages whose entry points have been loaded in this process, by the package's name."""
+
 
 @dataclass(frozen=True)
 class Registered:
@@ -71,6 +74,8 @@ class Registry:
         for point in entry_points(group=self.group):
             origin = f"{point.dist.name} {point.dist.version}" if point.dist else point.value
             names = self.load(point.name, point.load, origin)
+            if names and point.dist:
+                VERSIONS[point.dist.name] = point.dist.version
             if names and point.name not in names:
                 self._warn(point.name, origin, f"names a class that is registered already: use {' or '.join(names)}")
         for name, error in self.failed.items():

@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from magnet import plugins
 from magnet.cli.doctor import version_of
 from magnet.version import __version__
 
@@ -18,13 +19,14 @@ PACKAGES = ("torch", "lightning", "torchmetrics", "jsonargparse", "numpy", "roma
 
 
 def provenance() -> dict[str, Any]:
-    """When, by what command, from which commit and with which packages."""
+    """When, by what command, from which commit, with which packages and with which plug-ins, of those loaded so far."""
     return {
         "command": shlex.join(["magnet", *sys.argv[1:]]),
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "magnet": __version__,
         "python": sys.version.split()[0],
         "packages": {name: version_of(name) for name in PACKAGES},
+        "plug-ins": dict(sorted(plugins.VERSIONS.items())),
         "git": git_state(Path(__file__).parents[1]),
     }
 
