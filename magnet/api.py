@@ -102,7 +102,9 @@ def read(
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
     options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
-    files = [file for each in paths for file in ([each] if isinstance(each, str | Path) else each)]
+    files: list[Any] = [file for each in paths for file in (each if isinstance(each, list | tuple) else [each])]
+    if strange := [file for file in files if not isinstance(file, str | Path)]:
+        raise ValueError(f"paths: got {type(strange[0]).__name__}, expected files' names, or lists of them")
     got = reading.read(files, body, options)
     for warning in reading.warned(got.notes):
         warnings.warn(warning, stacklevel=2)
@@ -159,7 +161,7 @@ class Model:
         return self.predict(scene, "generation", context=0, frames=frames, **said)
 
     def start_crowd(
-        self, people: int, groups: Sequence[Scene] = (), spacing: float = SPACING, *, seed: int | None = None
+        self, people: int, groups: Scene | Sequence[Scene] = (), spacing: float = SPACING, *, seed: int | None = None
     ) -> Motion:
         """The first frames of a crowd, for `predict` to continue; see `magnet.generation.crowd_start.start_crowd`."""
         return Motion.of(start_crowd(self.denoiser, people, self.sampler, self._generator(seed), groups, spacing))

@@ -178,6 +178,8 @@ def write(
         ValueError: a suffix that nothing writes, or a scene that the format cannot hold.
         ImportError: an optional package is missing; says which.
     """
+    if not isinstance(title, str | None):
+        raise ValueError(f"title: got {title!r}, expected text")
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in WRITTEN:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
-from magnet.checks import require_number
-from magnet.export.formats import WRITTEN
+from magnet.checks import require_flag, require_number, require_whole
+from magnet.export.formats import MOST_FPS, WRITTEN
 from magnet.export.npz_files import is_ours, read_people
 from magnet.export.retarget import load_bvh, together
 from magnet.export.upright import WARNING
@@ -57,6 +57,21 @@ class Reading:
     start: int = 0
     end: int | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("fps", "in_fps"):
+            if getattr(self, name) is not None:
+                require_number(name, getattr(self, name), over=0, most=MOST_FPS)
+        for name in ("unit", "up"):
+            if not isinstance(getattr(self, name), str | None):
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a word, or None")
+        for name in ("trim", "keep_floor"):
+            require_flag(name, getattr(self, name))
+        require_whole("start", self.start)
+        if self.end is not None:
+            require_whole("end", self.end)
+        if not isinstance(self.joints, Mapping):
+            raise ValueError(f"joints: got {self.joints!r}, expected names by ours, such as {{'left_hip': 'Thigh_L'}}")
+
 
 def read(
     paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
@@ -83,8 +98,6 @@ def read(
             raise FileNotFoundError(f"{file}: no such file")
         regular(file)
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
-    if options.in_fps is not None:
-        require_number("in_fps", options.in_fps, over=0)
     if suffixes == {".bvh"}:
         if options.in_fps is not None:
             raise ValueError("in_fps: is for .npz files that say no frame rate; a .bvh says its own, --fps resamples")

@@ -36,7 +36,7 @@ def start_crowd(
     people: int,
     options: SamplerOptions | None = None,
     generator: torch.Generator | None = None,
-    groups: Sequence[Scene] = (),
+    groups: Scene | Sequence[Scene] = (),
     spacing: float = SPACING,
     betas: Tensor | None = None,
 ) -> Scene:
@@ -58,6 +58,7 @@ def start_crowd(
     """
     require_whole("people", people, 1, MOST)
     model = denoiser_of(model)
+    groups = [groups] if isinstance(groups, Scene) else groups
     turns = torch.Generator()
     turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
     if not groups:

@@ -61,6 +61,8 @@ def check_condition(cond: Tensor | None, scenes: int, weight: float) -> None:
     Raises:
         ValueError: what was got and expected.
     """
+    if cond is not None and not (isinstance(cond, Tensor) and cond.dim()):
+        raise ValueError(f"cond: got {type(cond).__name__}, expected a tensor, a condition for each scene")
     if cond is not None and len(cond) != scenes:
         raise ValueError(f"cond: got {len(cond)} conditions, expected one for each of {scenes} scenes")
     if cond is None and weight:

@@ -215,3 +215,19 @@ def test_whoever_really_lies_is_read_with_the_axis_that_is_said(tmp_path: Path) 
 def test_what_is_only_written_is_said_to_be_so(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"expected .npz or .bvh files, all of one kind; {suffix} can be written but"):
         reading.read(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"fps": 1e9}, r"fps: got 1e\+09, expected over 0 and at most 1000"),
+        ({"start": 1.5}, "start: got 1.5, expected a whole number"),
+        ({"end": "a"}, "end: got 'a', expected a whole number"),
+        ({"unit": []}, r"unit: got \[\], expected a word, or None"),
+        ({"trim": None}, "trim: got None, expected True or False"),
+        ({"joints": ["left_hip"]}, r"joints: got \['left_hip'\], expected names by ours"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_in_one_line(options: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        reading.Reading(**options)

@@ -30,6 +30,9 @@ def test_what_is_loaded_is_taken_and_no_model_is_refused_in_one_line(model) -> N
     assert record(loaded, scene, task, 8, 4, FAST).scene.frames == 12
     assert Live(loaded, start=random_scene(1, 32, 2, torch.Generator().manual_seed(0))).model is model
     assert start_crowd(loaded, 6, FAST).agents == 6
+    assert start_crowd(loaded, 6, FAST, groups=scene).frames == scene.frames, "one group needs no list"
+    with pytest.raises(ValueError, match="cond: got list, expected a tensor"):
+        generate(loaded, scene, task, 8, 4, options=FAST, cond=[0])  # type: ignore[arg-type]
     assert plan_of_scene(loaded, task, 2, 8, 4, FAST).known.shape == (3, 2)
     assert Agent(loaded, scene, ["a", "b"], "a", registry.get("agentic_sync")(), FAST).model is model
     with pytest.raises(ValueError, match=r'model: got str, expected a model, such as magnet\.load\("duet"\)'):
