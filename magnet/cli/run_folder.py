@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import os
 import shlex
@@ -11,14 +10,11 @@ import sys
 import time
 from collections.abc import Iterator
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
-from lightning.pytorch.loggers.logger import rank_zero_experiment
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -81,48 +77,6 @@ def run_folder(root: Path, out: str | None) -> Path:
             "first comes first: magnet predict FILE ... --out FILE"
         )
     return folder
-
-
-class Curves(CSVLogger):
-    """metrics.csv; where a training goes on in its own folder, so does the file, which Lightning's would delete."""
-
-    @property
-    @rank_zero_experiment
-    def experiment(self) -> Any:
-        if self._experiment is None:
-            file = Path(self.log_dir) / "metrics.csv"
-            before = file.with_suffix(".part")
-            if file.is_file():
-                file.replace(before)
-            writer: Any = super().experiment
-            if before.is_file():
-                before.replace(file)
-                with file.open(newline="") as rows:
-                    writer.metrics_keys = next(csv.reader(rows), [])
-        return self._experiment
-
-
-def loggers(folder: Path, wandb: str | None, fit: bool, goes_on: bool = False) -> list[Logger]:
-    """CSV always, TensorBoard where it is installed, wandb on request; only training is logged by default.
-
-    Raises:
-        CommandError: wandb is asked for and not installed.
-    """
-    root, name = str(folder.parent), folder.name
-    chosen: list[Logger] = []
-    if fit:
-        if find_spec("tensorboard") or find_spec("tensorboardX"):
-            chosen.append(TensorBoardLogger(root, "", name, default_hp_metric=False))
-        chosen.append((Curves if goes_on else CSVLogger)(root, "", name))
-    if wandb is not None:
-        if find_spec("wandb") is None:
-            raise CommandError('--wandb needs the package wandb: pip install "magnet-motion[wandb]"')
-        from lightning.pytorch.loggers import WandbLogger
-
-        folder.mkdir(parents=True, exist_ok=True)
-        label = f"{folder.parent.name}/{folder.name}"
-        chosen.append(WandbLogger(project="magnet", name=label, save_dir=str(folder), offline=wandb == "offline"))
-    return chosen
 
 
 def checkpoints(folder: Path, model: LightningModule, best: bool) -> list[Callback]:

@@ -21,7 +21,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_folder
+from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_folder, run_logs
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
@@ -263,11 +263,9 @@ class MagnetCLI(LightningCLI):
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
             callbacks.append(run_folder.progress_bar(sampling))
-        logger = config.get("logger")
-        if logger is None or logger is True:
-            logger = run_folder.loggers(self.folder, self._option("wandb"), fit, self._goes_on)
-            if fit and logger:
-                callbacks.append(LearningRateMonitor(logging_interval="step"))
+        logger = run_logs.loggers(self.folder, config.get("logger"), self._option("wandb"), fit, self._goes_on)
+        if fit and logger and not any(isinstance(c, LearningRateMonitor) for c in callbacks):
+            callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
             callbacks.append(Duration())
         if not fit and config.get("enable_checkpointing") is None:

@@ -263,7 +263,7 @@ def test_a_class_from_nowhere_is_not_imported_for_a_checkpoint(toy: Path, capsys
 def test_a_missing_wandb_names_the_install(
     toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("magnet.cli.run_folder.find_spec", lambda name: None)
+    monkeypatch.setattr("magnet.cli.run_logs.find_spec", lambda name: None)
     error = complaint(capsys, "fit", "--model", "ToyModel", "--wandb", "offline")
     assert 'pip install "magnet-motion[wandb]"' in error
 
