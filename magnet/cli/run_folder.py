@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -79,18 +79,40 @@ def run_folder(root: Path, out: str | None) -> Path:
     return folder
 
 
-def checkpoints(folder: Path, model: LightningModule, best: bool) -> list[Callback]:
-    """`last.ckpt` after every epoch or validation, also when training is interrupted; `best.ckpt` if it is wanted."""
+def checkpoints(folder: Path, model: LightningModule, callbacks: Sequence[Callback] = ()) -> list[Callback]:
+    """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt`.
+
+    Beside checkpoints that a user keeps, ours stay; but for best.ckpt where the user's own writes it.
+
+    Args:
+        folder: of the run.
+        model: says what is best, by `monitor` and `monitor_mode`.
+        callbacks: the user's.
+    """
     place = folder / "checkpoints"
     last = LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False)
-    if not best:
+    own = [each for each in callbacks if isinstance(each, ModelCheckpoint)]
+    if any(each.filename == "best" and Path(each.dirpath or place).resolve() == place.resolve() for each in own):
         return [last]
+    kind = BestCheckpoint if own else ModelCheckpoint
     monitor = getattr(model, "monitor", MONITOR)
     mode = getattr(model, "monitor_mode", "min")
-    return [
-        last,
-        ModelCheckpoint(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False),
-    ]
+    return [last, kind(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False)]
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Stands beside a user's own, which may measure the same; writes nothing where a model does not log its measure.
+
+    Lightning tells the states of callbacks apart by their class and options.
+    """
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_train_epoch_end(trainer, pl_module)
 
 
 class LastCheckpoint(ModelCheckpoint):

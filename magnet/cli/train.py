@@ -16,7 +16,7 @@ from typing import Any, Literal
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's calls, not ours
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -258,8 +258,7 @@ class MagnetCLI(LightningCLI):
         fit = self.command == "fit"
         if fit and config.get("enable_checkpointing") is not False and not config.get("fast_dev_run"):
             self._refuse_overwriting()
-            own = any(isinstance(callback, ModelCheckpoint) for callback in callbacks)
-            callbacks += run_folder.checkpoints(self.folder, self.model, best=not own)
+            callbacks += run_folder.checkpoints(self.folder, self.model, callbacks)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
             callbacks.append(run_folder.progress_bar(sampling))

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from magnet.cli import run_folder
 from magnet.files import CannotWrite
+from tests.toys import ToyData, ToyModel
 
 FLAGS = {
     "data.train_clips": 4, "data.val_clips": 2, "data.batch_size": 2, "data.epoch_size": 8, "data.window_frames": 16,
@@ -85,3 +87,29 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Pat
     record = run_folder.Record(tmp_path / "file" / "run", "", {}, {}, command="test")
     with pytest.raises(CannotWrite, match="is a file, expected a folder"):
         record.setup(Trainer(logger=False, accelerator="cpu"), LightningModule(), "test")
+
+
+def test_the_best_checkpoint_stays_beside_a_users_own(tmp_path: Path) -> None:
+    """Also beside one that measures the same, whose state Lightning must tell apart, but not beside its best.ckpt."""
+    model = ToyModel()
+    own = ModelCheckpoint(filename="mine", monitor="val/loss")
+    kept = [own, *run_folder.checkpoints(tmp_path, model, [own])]
+    assert [
+        each.filename for each in Trainer(callbacks=kept, logger=False, accelerator="cpu").checkpoint_callbacks
+    ] == [
+        "mine",
+        "last",
+        "best",
+    ]
+    there = ModelCheckpoint(tmp_path / "checkpoints", "best", monitor="other")
+    assert len(run_folder.checkpoints(tmp_path, model, [there])) == 1
+    assert len(run_folder.checkpoints(tmp_path, model, [ModelCheckpoint(tmp_path, "best")])) == 2
+
+
+def test_beside_a_users_own_a_measure_that_is_not_logged_stops_no_training(tmp_path: Path) -> None:
+    model, own = ToyModel(), ModelCheckpoint(tmp_path, "mine")
+    model.monitor = "val/else"
+    callbacks = [own, *run_folder.checkpoints(tmp_path, model, [own])]
+    words = {"logger": False, "accelerator": "cpu", "enable_progress_bar": False}
+    Trainer(max_epochs=1, callbacks=callbacks, **words).fit(model, ToyData())
+    assert {path.name for path in tmp_path.rglob("*.ckpt")} == {"mine.ckpt", "last.ckpt"}

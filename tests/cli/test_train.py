@@ -78,13 +78,13 @@ def test_weights_of_the_checkpoint_are_the_ones_tested(trained: Path) -> None:
     assert torch.equal(model.weight, stored["weight"])
 
 
-def test_a_run_that_keeps_checkpoints_of_its_own_leaves_the_last_one_too(toy: Path) -> None:
+def test_a_run_that_keeps_checkpoints_of_its_own_leaves_the_last_and_the_best_one_too(toy: Path) -> None:
     """Between the last of one's own and the end there may be hours."""
     kept = "--trainer.callbacks+=lightning.pytorch.callbacks.ModelCheckpoint"
     own = ("--trainer.callbacks.every_n_train_steps", "2", "--trainer.callbacks.filename", "own")
     go("fit", "--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "3", kept, *own, "--out", "mine")
     there = toy / "mine" / "checkpoints"
-    assert {path.name for path in there.glob("*.ckpt")} == {"own.ckpt", "last.ckpt"}
+    assert {path.name for path in there.glob("*.ckpt")} == {"own.ckpt", "last.ckpt", "best.ckpt"}
     assert torch.load(there / "last.ckpt", weights_only=True)["global_step"] == 3
     go("fit", "--ckpt_path", "mine/checkpoints/last.ckpt", "--trainer.max_steps", "4", "--out", "on")
     assert torch.load(toy / "on" / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 4
