@@ -39,6 +39,7 @@ from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
 from magnet.training.checkpoint_io import CheckpointIO
 from magnet.training.duration import Duration
+from magnet.training.step_numbers import StepNumbers
 
 MODELS = {"Denoiser": "magnet.denoiser.module", "Tokenizer": "magnet.tokenizer.module"}
 """Models with short names, and where they are; the first one is the default."""
@@ -266,7 +267,7 @@ class MagnetCLI(LightningCLI):
         if fit and logger and not any(isinstance(c, LearningRateMonitor) for c in callbacks):
             callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
-            callbacks.append(Duration())
+            callbacks = [StepNumbers(), *callbacks, Duration()]
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False
         self.record = self._record()

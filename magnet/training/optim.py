@@ -37,5 +37,18 @@ def warmup_cosine(
         done = min(1.0, max(0.0, (step - warmup) / max(total - warmup, 1), share_of_time(module.trainer)))
         return rise * 0.5 * (1 + math.cos(math.pi * done))
 
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+    schedule = Rates(optimizer, rate)
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class Rates(torch.optim.lr_scheduler.LambdaLR):
+    """Where a run goes on, its next step has the rate of this run's length, not the one the last run would have had.
+
+    A run that had reached its end left a rate of zero, which torch changes only after a step.
+    """
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        for group, full, rate in zip(self.optimizer.param_groups, self.base_lrs, self.lr_lambdas, strict=True):
+            group["lr"] = full * rate(self.last_epoch)
+        self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
