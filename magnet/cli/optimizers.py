@@ -6,12 +6,18 @@ from types import MethodType
 from typing import Any
 
 from jsonargparse import Namespace
-from lightning.pytorch import LightningModule
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, instantiate_class
 from torch.optim import Optimizer
 
+from magnet.cli.errors import CommandError
+
 KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
 """Options, and what a model does without them (`magnet.training.optim`)."""
+
+
+MADE_WITH = "magnet_optimizer"
+"""Key of a checkpoint: the class of its optimizer, whose state torch would give to any other."""
 
 
 def add_optimizer_arguments(parser: LightningArgumentParser) -> None:
@@ -74,3 +80,47 @@ def optimizer_of(configured: Any) -> Optimizer:
     if not isinstance(configured, Optimizer):
         raise ValueError(f"--optimizer: the model's own is {type(configured).__name__}, expected an Optimizer")
     return configured
+
+
+class SameOptimizer(Callback):
+    """Writes into checkpoints which optimizer trained, and refuses to go on with another one.
+
+    Args:
+        checkpoint: the file, for messages.
+    """
+
+    def __init__(self, checkpoint: Any = None) -> None:
+        self.checkpoint = checkpoint
+        self.before: list[str] | None = None
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        checkpoint[MADE_WITH] = [type(optimizer).__name__ for optimizer in trainer.optimizers]
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.before = made_with(checkpoint)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        now = [type(optimizer).__name__ for optimizer in trainer.optimizers]
+        if self.before is not None and self.before != now:
+            before, other = " and ".join(self.before), " and ".join(now)
+            raise CommandError(
+                f"{self.checkpoint} is of a run with {before}, and {other} cannot go on with its state: go on with the "
+                f"same optimizer, or begin a new run from its weights alone, with --model.start_from {self.checkpoint} "
+                "in place of --ckpt_path"
+            )
+
+    on_sanity_check_start = on_train_start
+
+
+def made_with(checkpoint: dict[str, Any]) -> list[str] | None:
+    """The classes of a checkpoint's optimizers; of an older one by their fields, None where these do not tell."""
+    if MADE_WITH in checkpoint:
+        return list(checkpoint[MADE_WITH])
+    groups = [state["param_groups"][0] for state in checkpoint.get("optimizer_states") or () if state["param_groups"]]
+    names = []
+    for group in groups:
+        if "decoupled_weight_decay" in group and "muon" not in group:
+            names.append("AdamW" if group["decoupled_weight_decay"] else "Adam")
+        elif {"momentum", "dampening"} <= group.keys():
+            names.append("SGD")
+    return names if names and len(names) == len(groups) else None

@@ -122,6 +122,11 @@ class LastCheckpoint(ModelCheckpoint):
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save, but not where a run was refused before its first step."""
+        if not isinstance(exception, CommandError):
+            super().on_exception(trainer, pl_module, exception)
+
 
 def progress_bar(sampling: bool = False) -> ProgressBar:
     """A bar on a terminal, now and then a line elsewhere; for sampling it counts denoising steps."""

@@ -267,7 +267,7 @@ class MagnetCLI(LightningCLI):
         if fit and logger and not any(isinstance(c, LearningRateMonitor) for c in callbacks):
             callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
-            callbacks = [StepNumbers(), *callbacks, Duration()]
+            callbacks = [StepNumbers(), *callbacks, Duration(), optimizers.SameOptimizer(self.checkpoint)]
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False
         self.record = self._record()

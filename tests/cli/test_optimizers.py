@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,6 +41,28 @@ def test_a_scheduler_alone_drives_the_models_own_optimizer(toy: None) -> None:
 def test_without_either_the_models_own_trains(toy: None) -> None:
     (optimizer,) = trained().optimizers
     assert type(optimizer) is torch.optim.SGD and optimizer.param_groups[0]["lr"] == 0.5
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_a_run_does_not_go_on_with_another_optimizer(
+    toy: Path, capsys: pytest.CaptureFixture[str], older: bool
+) -> None:
+    """Adam would take over AdamW's state and decay without a word, SGD would fail on a field that it lacks."""
+    trained("--optimizer", "AdamW", "--optimizer.lr", "0.25", "--out", "run")
+    file = toy / "run" / "checkpoints" / "last.ckpt"
+    if older:
+        checkpoint = torch.load(file, weights_only=True)
+        assert checkpoint.pop("magnet_optimizer") == ["AdamW"]
+        torch.save(checkpoint, file)
+        file.with_name("last.ckpt.sha256").unlink()
+    more = ["--ckpt_path", str(file), "--trainer.max_epochs", "3"]
+    for name in ("SGD", "Adam"):
+        words = ["--optimizer", name, "--optimizer.lr", "0.1", "--out", "other"]
+        assert cli.main(["fit", *more, *QUIET, *words]) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert "is of a run with AdamW" in error and f"--model.start_from {file}" in error
+        assert not (toy / "other" / "run.json").exists()
+    assert cli.main(["fit", *more, *QUIET, "--out", "other"]) == 0
 
 
 def test_an_optimizer_is_found_in_whatever_is_configured() -> None:
