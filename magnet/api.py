@@ -46,6 +46,8 @@ def load(
 ) -> Model:
     """Load a trained model: a shipped one by name ("duet"), one of a hub ("hub:owner/name"), or a checkpoint's path.
 
+    A run's folder will do, too: its best checkpoint is loaded, or the last one where there is no best.
+
     Args:
         device: device to run on.
         steps: denoising steps; fewer are faster and coarser. None: the sampler's.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import pickle
 import re
 import tempfile
 import zipfile
@@ -45,13 +46,23 @@ def names() -> list[str]:
 def named(name_or_path: str | Path) -> Path:
     """The folder of a shipped model of that name, or of a hub's model after fetching it; otherwise the path itself.
 
+    The path of a run's folder stands for its best checkpoint, or for the last one where there is no best.
+
     Raises:
         ValueError, ImportError: as `from_hub`.
     """
     if str(name_or_path).startswith(HUB):
         return from_hub(str(name_or_path))
     shipped = FOLDER / str(name_or_path)
-    return shipped if (shipped / "config.json").exists() else Path(name_or_path)
+    return shipped if (shipped / "config.json").exists() else of_run(Path(name_or_path))
+
+
+def of_run(path: Path, order: tuple[str, ...] = ("best", "last")) -> Path:
+    """The checkpoint that a run's folder stands for, the first of those that are there; of anything else the path."""
+    if path.is_dir() and not (path / "config.json").exists():
+        files = [path / "checkpoints" / f"{name}.ckpt" for name in order]
+        return next((file for file in files if file.is_file()), path)
+    return path
 
 
 def from_hub(name: str) -> Path:
@@ -126,11 +137,40 @@ def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except FileNotFoundError:
         raise
+    except pickle.UnpicklingError as error:  # whose text is a screen of advice to read the file all the same
+        raise ValueError(
+            f"{path}: not a checkpoint that can be read safely: it is damaged, or holds more than weights and plain "
+            "values, which could run code"
+        ) from error
     except Exception as error:
         raise ValueError(
             f"{path}: not a checkpoint that can be read safely ({type(error).__name__}: {error})"
         ) from error
     return renamed_checkpoint(checkpoint) if isinstance(checkpoint, dict) else checkpoint
+
+
+def contents(checkpoint: Any) -> str:
+    """What a file that was read holds, for messages."""
+    if not isinstance(checkpoint, dict):
+        return "no checkpoint"
+    state = checkpoint.get("state_dict")
+    if not isinstance(state, dict):
+        bare = bool(checkpoint) and all(isinstance(value, Tensor) for value in checkpoint.values())
+        return "a bare state_dict, without the options that a model is built by" if bare else "no model"
+    if "tokenizer_hyper_parameters" in checkpoint:
+        return "a denoiser"
+    return "a tokenizer" if any(name.startswith("vqvae.") for name in state) else "another model"
+
+
+def require_denoiser(checkpoint: Any, path: str | Path | None = None, advice: str = "") -> None:
+    """Raises ValueError where a checkpoint holds anything but a denoiser; `path` is said where it is known."""
+    if not isinstance(checkpoint, dict) or "tokenizer_hyper_parameters" not in checkpoint:
+        held = contents(checkpoint)
+        if not advice:
+            advice = "give that of a denoiser trained with it (magnet fit --model Denoiser --model.tokenizer FILE)"
+        wanted = advice if held == "a tokenizer" else "give one that `magnet fit` wrote, or the name of a shipped model"
+        where = "" if path is None else f"{path}: "
+        raise ValueError(f"{where}not a denoiser's checkpoint, it holds {held}; {wanted}")
 
 
 def checksum_file(path: Path) -> Path:
@@ -189,7 +229,11 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
 
 def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
     if not (folder / "config.json").exists():
-        raise ValueError(f"{folder}: a folder without config.json is no released model")
+        there = ", ".join(sorted(str(file.relative_to(folder)) for file in folder.glob("**/*.ckpt"))[:3])
+        raise ValueError(
+            f"{folder}: neither the folder of a released model (config.json) nor of a run (checkpoints/best.ckpt or "
+            f"last.ckpt); " + (f"give one of its files, such as {there}" if there else "there is no checkpoint in it")
+        )
     try:
         config = json.loads((folder / "config.json").read_bytes())
         whole = config.get("sha256", own := _config_hash(config)) == own

@@ -185,7 +185,7 @@ class Stored:
                 raise CommandError(f"{path}: {reason}; it is not loaded") from error
             raise CommandError(textwrap.shorten(str(error).partition("\n")[0], 400)) from error
         if not isinstance(checkpoint, dict) or "state_dict" not in checkpoint:
-            raise CommandError(f"{path}: not a checkpoint of a model, it has no state_dict")
+            raise CommandError(f"{path}: not a checkpoint of a model, it holds {checkpoints.contents(checkpoint)}")
         config = checkpoint.get(CONFIG_KEY) or {}
         model = config.get("model") or _from_hyper_parameters(checkpoint)
         return cls(path, model, config.get("data"))
@@ -264,6 +264,11 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
     short = _ours(named, models)
     if short is None:  # somebody's own model knows what it starts from
         return {}
+    if short == "Denoiser":
+        try:
+            checkpoints.require_denoiser(checkpoint, name, "a tokenizer is given with --model.tokenizer")
+        except ValueError as error:
+            raise CommandError(f"--model.start_from {error}") from error
     fields = "tokenizer_hyper_parameters" if denoiser and short == "Tokenizer" else "hyper_parameters"
     stored = checkpoint.get(fields) or {}
     path = f"{models[short]}.{short}" if named.rpartition(".")[2] == short else named

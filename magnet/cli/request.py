@@ -145,8 +145,9 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         return checkpoints.requeued(Path(out))
     if name is None and (command == "fit" or given.only_shown):
         return None
-    if command == "fit":
-        return checkpoint_config.find_checkpoint(name, [Path(out) if out else runs / run])
+    if command == "fit":  # a run goes on from where it ended, not from where it was best
+        found = checkpoints.of_run(Path(name), ("last", "best"))
+        return checkpoint_config.find_checkpoint(str(found), [Path(out) if out else runs / run])
     folders = [Path(out or runs), runs / run, runs]
     return checkpoint_config.find_checkpoint(name, folders)
 

@@ -40,11 +40,7 @@ def denoiser_of(path: str | Path) -> dict[str, Any]:
         ValueError: no such checkpoint, or another model's.
     """
     checkpoint = checkpoints.read(checkpoints.resolve(path))
-    if "tokenizer_hyper_parameters" not in checkpoint:
-        raise ValueError(
-            f"start_from: {path} is not a denoiser's checkpoint, for it carries no tokenizer; a tokenizer's is given "
-            "with --model.tokenizer"
-        )
+    checkpoints.require_denoiser(checkpoint, f"start_from: {path}", "a tokenizer is given with --model.tokenizer")
     return checkpoint
 
 

@@ -117,8 +117,7 @@ class TokenModelCore(nn.Module):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
         checkpoint.update(renamed_checkpoint(checkpoint))
-        if "tokenizer_hyper_parameters" not in checkpoint:
-            raise ValueError("this is not a denoiser's checkpoint: it carries no tokenizer")
+        checkpoints.require_denoiser(checkpoint)
         stored = checkpoint["tokenizer_hyper_parameters"]
         given = dict(self.tokenizer.hparams) if self.built and isinstance(self.tokenizer, TokenizerCore) else None
         if not self.built or stored != given:
@@ -134,8 +133,7 @@ class TokenModelCore(nn.Module):
         """
         path = checkpoints.resolve(name_or_path)
         checkpoint = checkpoints.read(path, halves=True)
-        if "tokenizer_hyper_parameters" not in checkpoint:
-            raise ValueError(f"{path}: not a denoiser's checkpoint, for it carries no tokenizer")
+        checkpoints.require_denoiser(checkpoint, path)
         fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these
         stored = {name: value for name, value in checkpoint["hyper_parameters"].items() if name in fields}
         model = cls(**{**stored, **{name: None for name in ("tokenizer", "start_from") if name in fields}})

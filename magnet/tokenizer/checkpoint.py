@@ -40,13 +40,19 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     checkpoints.verify(path)
     try:
         checkpoint = checkpoints.load(path, mmap=True)
-        fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
     except Exception as error:  # whatever a damaged or foreign file makes torch raise
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
             f"{path}: not a tokenizer's checkpoint ({type(error).__name__}: {reason}); expected one written by "
             f"`magnet fit`"
         ) from error
+    held = checkpoints.contents(checkpoint)
+    if held not in ("a tokenizer", "a denoiser") or "hyper_parameters" not in checkpoint:
+        raise ValueError(
+            f"{path}: not a tokenizer's checkpoint, it holds {held}; expected one that `magnet fit --model Tokenizer` "
+            "wrote, or a denoiser's, which carries its tokenizer"
+        )
+    fields, state = checkpoint["hyper_parameters"], checkpoint["state_dict"]
     if "tokenizer_hyper_parameters" in checkpoint:
         fields = checkpoint["tokenizer_hyper_parameters"]
         if fields is None:

@@ -229,4 +229,8 @@ class Tokenizer(TokenizerCore, L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint.update(renamed_checkpoint(checkpoint))
+        if "tokenizer_hyper_parameters" in checkpoint:
+            raise ValueError(
+                "not a tokenizer's checkpoint, it holds a denoiser; --model.start_from takes over the tokenizer in one"
+            )
         check_fields(checkpoint.get("hyper_parameters", {}), self.hparams)

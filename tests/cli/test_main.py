@@ -243,7 +243,7 @@ def test_a_bad_checkpoint_is_refused_in_a_line(toy: Path, capsys: pytest.Capture
     torch.save({"state_dict": {}, "bomb": Bomb()}, toy / "bomb.ckpt")
     (toy / "text.ckpt").write_text("hello")
     (toy / "short.ckpt").write_bytes((toy / "none.ckpt").read_bytes()[:200])
-    assert "no state_dict" in complaint(capsys, "test", "--ckpt_path", "none.ckpt")
+    assert "a bare state_dict" in complaint(capsys, "test", "--ckpt_path", "none.ckpt")
     assert "could run code" in complaint(capsys, "test", "--ckpt_path", "bomb.ckpt")
     assert not (toy / "exploded").exists()
     for name in ("text.ckpt", "short.ckpt"):

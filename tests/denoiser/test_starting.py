@@ -74,7 +74,9 @@ def test_a_denoiser_of_raw_poses_is_started_from_as_well(tmp_path: Path) -> None
 def test_a_tokenizers_checkpoint_is_no_start(tmp_path: Path) -> None:
     tokenizer = tiny_denoiser().tokenizer
     torch.save({"state_dict": tokenizer.state_dict(), "hyper_parameters": dict(tokenizer.hparams)}, tmp_path / "t.ckpt")
-    with pytest.raises(ValueError, match=r"t\.ckpt is not a denoiser's checkpoint.*--model\.tokenizer"):
+    with pytest.raises(
+        ValueError, match=r"t\.ckpt: not a denoiser's checkpoint, it holds a tokenizer; .*--model\.tokenizer"
+    ):
         tokenizer_of(tmp_path / "t.ckpt")
 
 
