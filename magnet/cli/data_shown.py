@@ -17,11 +17,16 @@ if TYPE_CHECKING:
     from magnet.datamodules.reading.recording import Reader
     from magnet.plugins import Registered
 
-BODIES = {"smplx": "--body SMPLX_NEUTRAL.npz", "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL"}
-"""The body that shape numbers need, by family: SMPL's are expressed in SMPL-X's."""
+BODIES = {
+    "smplx": "--body SMPLX_NEUTRAL.npz",
+    "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL",
+    "smplh": "--body SMPLX_NEUTRAL.npz --bodies SMPLH",
+}
+"""The body that shape numbers need, by family: SMPL's and SMPL-H's are expressed in SMPL-X's."""
 WHERE = {
     "smplx": "SMPL-X's file, npz or pkl, is from https://smpl-x.is.tue.mpg.de (register)",
     "smpl": "SMPL: the folder of its files, npz or pkl, from https://smpl.is.tue.mpg.de (register)",
+    "smplh": "SMPL-H: the folder of its files, npz or pkl, from https://mano.is.tue.mpg.de (register)",
 }
 
 
@@ -66,14 +71,15 @@ def show_reader(console: Console, kind: type[Reader]) -> None:
     wide = max((len(pattern) for pattern, _ in kind.layout), default=0)
     for number, (pattern, what) in enumerate(kind.layout):
         show(console, "" if number else "under --root", f"{pattern:<{wide}}  {what}")
-    body = BODIES.get(kind.family, "")
+    family = next(iter(kind.shapes_of), kind.family)
+    body = BODIES.get(family, "")
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
     show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
     if kind.own:
         show(console, "", f"magnet fit --config {TUNING} --data.path STORE   # {WHERE_CONFIGS}")
     show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
     if body:
-        show(console, "", WHERE[kind.family])
+        show(console, "", WHERE[family])
     if kind.fake:
         show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
 

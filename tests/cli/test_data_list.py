@@ -49,3 +49,12 @@ def test_one_is_told_of_by_the_name_of_its_files_or_of_its_class(name: str, titl
     console = Console(record=True, width=120)
     assert draw_list(console, name)
     assert console.export_text().startswith(f"{title}  ")
+
+
+def test_the_body_is_that_of_a_data_sets_shape_numbers() -> None:
+    """InterHuman's are SMPL-H's, Hi4D's SMPL's."""
+    for name, bodies, site in (("interhuman", "SMPLH", "mano.is.tue"), ("hi4d", "SMPL", "smpl.is.tue")):
+        console = Console(record=True, width=200)
+        draw_list(console, name)
+        text = console.export_text()
+        assert f"--bodies {bodies}\n" in text and site in text
