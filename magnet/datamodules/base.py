@@ -74,7 +74,8 @@ class MotionDataModule(LightningDataModule):
         epoch_size: training windows per epoch over all processes; None: four times as many as fit side by side into
             the training frames.
         val_batch_size: scenes a validation batch.
-        seed: seeds all randomness here: sample i of epoch e depends only on (seed, e, i).
+        seed: seeds all randomness here: sample i of epoch e depends only on (seed, e, i). Of a prepared store that
+            processes divide among them (`spread`), it depends on their number as well.
         body_model: "open" or the path of a body file in SMPL-X's npz layout.
         device_resident: keep all frames on the trainer's device; False: gather on the CPU and send batches,
             for data sets larger than the GPU's memory.

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from magnet.datamodules import Clip, Mixed
+from magnet.datamodules.base import MotionDataModule
 from magnet.datamodules.fakes.motion import made_up_body
 from magnet.datamodules.options import Augmentation
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
@@ -202,3 +203,21 @@ def test_too_few_clips_are_drawn_from_by_everybody(store):
     assert alone.owners(np.ones(len(mapped.names)), 2) is None
     owners = mapped.owners(mapped.length / mapped.length.sum(), 2)
     assert owners is not None and owners.tolist() == [0] * 6 + [1] * 6
+
+
+def test_what_a_page_and_help_say_of_the_number_of_processes_holds(store):
+    """Samples of a store that is divided depend on it; undivided they do not."""
+
+    def global_batch(world: int, spread: bool) -> list[str]:
+        names = []
+        for rank in range(world):
+            one = data(store, spread=spread, batch_size=8 // world, epoch_size=64, **PLAIN)
+            one.trainer = FakeTrainer(global_rank=rank, world_size=world)
+            names += next(iter(one.train_dataloader())).names
+        return names
+
+    assert global_batch(2, spread=True) != global_batch(1, spread=True)
+    assert global_batch(2, spread=False) == global_batch(1, spread=False)
+    page = (Path(__file__).parents[3] / "docs" / "scale.md").read_text()
+    assert "another number of\nprocesses draws other samples" in page
+    assert "depends on their number as well" in " ".join((MotionDataModule.__doc__ or "").split())
