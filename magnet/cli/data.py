@@ -23,6 +23,7 @@ from magnet.cli.data_shown import (
     show_problems,
     show_skipped,
     show_splits,
+    why_untrained,
 )
 from magnet.cli.errors import CommandError, no_such
 
@@ -207,7 +208,7 @@ def run_info(given: argparse.Namespace) -> int:
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
         out.print(f"{len(m['left out'])} takes are in no split")
-    show_gaps(m["splits"])
+    show_gaps(m["splits"], "limit" in m)
     return 0
 
 
@@ -225,7 +226,7 @@ def run_check(given: argparse.Namespace) -> int:
     show_splits(found.splits, title=found.title)
     show_notes(found.notes)
     show_skipped(found.skipped)
-    show_gaps(found.splits)
+    show_gaps(found.splits, found.limited)
     picture = Path(given.picture or f"{found.name}_check.png")
     if given.picture != "none" and check.draw(found, picture, body):
         print(f"picture: {picture}")
@@ -295,12 +296,16 @@ def run_prepare(given: argparse.Namespace) -> int:
         print(absent_note(m["listed but not there"]))
     print(f"{report.made - report.failed} takes converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
-    show_gaps(m["splits"])
+    show_gaps(m["splits"], "limit" in m)
     takes = sum(split["takes"] for split in m["splits"].values())
     kind = registry.reader(name)
     body = "" if given.body == "open" else f" --data.body_model {shlex.quote(given.body)}"
     place = shlex.quote(str(out))
-    print(f"{takes} takes are in {out}; {len(m['skipped'])} were skipped. To train on it:")
+    said = f"{takes} takes are in {out}; {len(m['skipped'])} were skipped."
+    if why := why_untrained(m):
+        print(f"{said} Nothing can be trained on it, for split train is empty: {why}")
+        return 0
+    print(f"{said} To train on it:")
     longest = int(report.folder.split("test").frames.max(initial=0))
     if kind.own:
         tuned = f"magnet fit --config {TUNING} --data.path {place}{body}"

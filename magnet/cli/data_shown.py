@@ -143,13 +143,26 @@ def show_skipped(skipped: list[tuple[str, str]]) -> None:
         show_some(lines, SKIPPED_SHOWN, ", all of them in the store's manifest.json")
 
 
-def show_gaps(splits: Mapping[str, Mapping[str, Any]]) -> None:
-    """Warn of what the splits lack, on the error stream."""
+def show_gaps(splits: Mapping[str, Mapping[str, Any]], limited: bool = False) -> None:
+    """Warn of what the splits lack, on the error stream; `limited`: not all takes were asked for."""
     from magnet.datamodules.preparing.check import split_gaps
 
     clips: Any = {split: {int(n): k for n, k in of["clips by people"].items()} for split, of in splits.items()}
-    for line in split_gaps(clips):
+    for line in split_gaps(clips, limited):
         print(f"WARNING: {line}", file=sys.stderr)
+
+
+def why_untrained(manifest: Mapping[str, Any]) -> str | None:
+    """Why nothing of a store can be trained on, by its manifest; None where something can."""
+    if manifest["splits"].get("train", {}).get("clips"):
+        return None
+    counts = {
+        "takes were skipped, as is listed above": len(manifest["skipped"]),
+        "takes are in no split": len(manifest["left out"]),
+        "names of the lists are not in the download": len(manifest["listed but not there"]),
+    }
+    facts = [f"{count} {what}" for what, count in counts.items() if count]
+    return f"no take that can be used is in train by {manifest['splits by']}" + "".join(f"; {fact}" for fact in facts)
 
 
 def show_notes(notes: list[str]) -> None:

@@ -183,6 +183,16 @@ def test_what_can_be_put_right_is_said_in_one_line(copy, capsys, words, message)
     assert message in said and len(said.splitlines()) == 1
 
 
+def test_where_nothing_is_in_train_no_training_is_proposed(copy, capsys):
+    takes = [take.name for take in registry.reader("dd100")(copy / "dl").takes()]
+    (copy / "mine.txt").write_text(f"{takes[0]} val\n{takes[1]} test\n")
+    work = ["--splits", "mine.txt", "--body", "dl/body.npz", "--workers", "1"]
+    assert cli.main(["data", "prepare", "dd100", "--root", "dl", "--out", "mine", *work]) == 0
+    told, heard = capsys.readouterr()
+    assert "To train on it" not in told and "magnet fit" not in told and "--limit" not in heard
+    assert "split train is empty: no take that can be used is in train by a list given by the user; 2 takes" in told
+
+
 @pytest.mark.parametrize("command", ["prepare", "check dl", "check store", "info"])
 def test_an_empty_split_is_said_loudly(copy, capsys, command):
     takes = [take.name for take in registry.reader("dd100")(copy / "dl").takes()]

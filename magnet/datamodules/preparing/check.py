@@ -49,6 +49,7 @@ class CheckReport:
     skipped: list[tuple[str, str]] = field(default_factory=list)  # take, why
     notes: list[str] = field(default_factory=list)
     scenes: list[tuple[str, Scene]] = field(default_factory=list)  # for the picture
+    limited: bool = False  # not all takes were asked for
 
     def count_skipped(self, takes: int, short: int = 0) -> None:
         """Skipped ones of so many takes are a problem, but for those that are only short."""
@@ -76,7 +77,7 @@ def check_store(folder: StoreReader, body: Body | None = None, progress: Progres
         progress: is told of progress, by file.
     """
     manifest = folder.manifest
-    found = CheckReport(manifest["name"], manifest["title"])
+    found = CheckReport(manifest["name"], manifest["title"], limited="limit" in manifest)
     files = folder.files()
     for number, (name, digest) in enumerate(sorted(files.items())):
         if progress is not None:
@@ -229,7 +230,7 @@ def check_download(
     at_least(1, workers=workers, limit=limit)
     reader: Reader = job.reader()
     body = job.body()
-    found = CheckReport(reader.name, reader.title)
+    found = CheckReport(reader.name, reader.title, limited=limit is not None)
     use = select_takes(reader, splits, limit)
     takes = use.takes
     found.notes += reader.summary()
@@ -323,16 +324,18 @@ WITHOUT: dict[Split, str] = {
     "val": "training goes without validation",
     "test": "magnet test has no scenes",
 }
-YOURS = "a split of your own is given to prepare with --splits FILE, lines NAME SPLIT; --limit may be too low"
+YOURS = "a split of your own is given to prepare with --splits FILE, lines NAME SPLIT"
+LIMITED = "; --limit may be too low"
 
 
-def split_gaps(clips: Mapping[Split, Mapping[int, int]]) -> list[str]:
+def split_gaps(clips: Mapping[Split, Mapping[int, int]], limited: bool = False) -> list[str]:
     """A sentence for every gap, then what to do; none where every split has clips of every number of people.
 
     Somebody alone is no gap where others are together: data sets hold such clips to learn bodies from.
 
     Args:
         clips: number of clips by number of people, of each split that has any.
+        limited: not all takes were asked for (`--limit`).
     """
     counts = {split: {n: count for n, count in clips.get(split, {}).items() if count} for split in SPLITS}
     if not any(counts.values()):
@@ -344,4 +347,4 @@ def split_gaps(clips: Mapping[Split, Mapping[int, int]]) -> list[str]:
         if lacking:
             has = ", ".join(f"{split} {of[people]}" for split, of in counts.items() if people in of)
             said.append(f"no clip of {people} people in {' and '.join(lacking)} ({has})")
-    return [*said, YOURS] if said else []
+    return [*said, YOURS + LIMITED * limited] if said else []

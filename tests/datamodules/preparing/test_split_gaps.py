@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from magnet.datamodules.preparing.check import YOURS, split_gaps
+from magnet.datamodules.preparing.check import LIMITED, YOURS, split_gaps
 
 FULL = {"train": {2: 9, 3: 4}, "val": {2: 1, 3: 1}, "test": {2: 2, 3: 1}}
 
@@ -38,3 +38,4 @@ FULL = {"train": {2: 9, 3: 4}, "val": {2: 1, 3: 1}, "test": {2: 2, 3: 1}}
 )  # fmt: skip
 def test_every_gap_is_said_and_what_to_do(clips, said) -> None:
     assert split_gaps(clips) == ([*said, YOURS] if said else [])
+    assert split_gaps(clips, limited=True) == ([*said, YOURS + LIMITED] if said else [])
