@@ -193,7 +193,7 @@ def _readable(root: Path, names: Sequence[str]) -> list[str]:
     """Those data sets whose reader finds takes."""
     found = []
     for name in names:
-        with suppress(Exception):  # what this one lacks; a stranger's reader may raise anything
+        with suppress(Exception, SystemExit):  # what this one lacks; a stranger's reader may raise anything
             found += [name] if registry.reader(name)(root).found() else []
     return found
 

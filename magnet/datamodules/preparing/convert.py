@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import connection
 from pathlib import Path
@@ -25,7 +26,7 @@ from magnet.datamodules import registry
 from magnet.datamodules.preparing.canonicalize import CANONICALIZE_VERSION, CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check_people import check_shapes
 from magnet.datamodules.preparing.genders import load_bodies, one_body
-from magnet.datamodules.reading.recording import Gender, Reader, Take
+from magnet.datamodules.reading.recording import DataError, Gender, Reader, Take
 from magnet.datamodules.store.reader import FORMAT, body_hash
 from magnet.datamodules.store.rows import ROW, encode
 from magnet.files import file_hash, write_whole
@@ -63,6 +64,29 @@ def require_family(kind: type[Reader], body: Body, option: str, file: str) -> No
     )
 
 
+@contextmanager
+def named_errors(kind: type[Reader], what: str) -> Iterator[None]:
+    """Whatever a reader's code raises, or that it ends the program, as one line that names the data set.
+
+    Args:
+        kind: the reader, perhaps a stranger's.
+        what: is not possible, for errors that are no sentences.
+
+    Raises:
+        DataError: it raised something.
+    """
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, DataError) and kind.title in text:
+            raise
+        raise DataError(text if kind.title in text else f"{kind.title}: {text}") from error
+    except (Exception, SystemExit) as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        raise DataError(f"{kind.title}: {what} ({text}); mend {kind.__module__}.{kind.__qualname__}") from error
+
+
 @dataclass(frozen=True)
 class PrepareJob:
     """What is to be prepared, and how; plain values that every process builds its own reader and body from.
@@ -84,8 +108,14 @@ class PrepareJob:
     body_files: tuple[str, ...] = ()
 
     def reader(self) -> Reader:
-        """The data set's reader on the download."""
-        return registry.reader(self.name)(self.root, **self.options)
+        """The data set's reader on the download.
+
+        Raises:
+            DataError: the reader cannot be made; names the data set.
+        """
+        kind = registry.reader(self.name)
+        with named_errors(kind, f"its reader cannot be made on {self.root}"):
+            return kind(self.root, **self.options)
 
     def body(self) -> Body:
         """The body model.
@@ -224,7 +254,7 @@ def convert(
         )
     except (ValueError, OSError) as error:
         return ConvertedTake.failed(about(take, str(error) or type(error).__name__, reader.root))
-    except Exception as error:  # a reader that does not know what to say: the others go on
+    except (Exception, SystemExit) as error:  # a reader that does not know what to say: the others go on
         return ConvertedTake.failed(about(take, f"{type(error).__name__}: {error}", reader.root))
     return ConvertedTake(
         error=None,

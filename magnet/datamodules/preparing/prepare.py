@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from magnet.datamodules.clip import SPLITS, Split, at_least
-from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all, take_key
+from magnet.datamodules.preparing.convert import (
+    ConvertedTake,
+    PrepareJob,
+    Progress,
+    convert_all,
+    named_errors,
+    take_key,
+)
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
@@ -121,10 +128,12 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
     Raises:
         DataError: there are none, two of a name, or a group in two splits.
     """
-    takes = reader.takes() if splits is None else reader.found()
+    with named_errors(type(reader), f"its takes cannot be listed under {reader.root}"):
+        takes = reader.takes() if splits is None else reader.found()
     if not takes:
         raise DataError(f"{reader.title}: no takes under {reader.root}; is it the folder of the download?")
-    listed = reader.official() if splits is None else splits
+    with named_errors(type(reader), "its lists of splits cannot be read"):
+        listed = reader.official() if splits is None else splits
     absent = sorted(set(listed or ()) - {take.group if splits is None else take.name for take in takes})
     names = {take.name for take in takes}
     if len(names) < len(takes):
