@@ -18,6 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
+from magnet.cli.nested import place_of, with_place
 
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
@@ -182,6 +183,8 @@ class Parser(LightningArgumentParser):
         if unknown or refused:
             said = unknown[1].partition("=")[0] if unknown else refused[1] if refused else ""
             name = self._written(said.lstrip("-"), said)
+            if refused and name == said and (found := place_of(self.layers, said)):
+                return f"no option {found[0]}: {found[1]} has no {said}"
             return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:
@@ -194,7 +197,7 @@ class Parser(LightningArgumentParser):
             return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
         key = re.search(r'Parser key "([\w.]+)"', message)
         if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
-            return told
+            return with_place(self.layers, told)
         if key and (file := re.search(r"Unable to load config ['\"](.*?)['\"]", message)):
             group = self._written(key[1], f"--{key[1]}")
             return f"{group}: got {file[1]}, expected a YAML file of its fields, or {group}.FIELD VALUE"
