@@ -103,6 +103,8 @@ def test_what_packages_add_is_listed_and_what_failed_has_its_reason(
         EntryPoint("TheirShoes", "theirs_for_doctor:Shoes", "magnet.datamodules"),
         EntryPoint("their_number", "shoes_of_mine:Number", "magnet.metrics"),
     ]
+    for registry in (TASKS, DATA, METRICS):
+        registry.discover()  # ours register once, and the tests after this one need them too
     monkeypatch.setattr(plugins, "entry_points", lambda group: [each for each in points if each.group == group])
     for registry in (TASKS, DATA, METRICS):
         monkeypatch.setattr(registry, "known", dict(registry.known))
