@@ -49,7 +49,7 @@ class Cost(NamedTuple):
 
 def held_gb() -> float:
     """Memory that the process holds now."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e9
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * resource.getpagesize() / 1e9
 
 
 class Memory:

@@ -200,7 +200,7 @@ def fit(data: Any, steps: int) -> str:
 
 def memory() -> dict[str, float]:
     """MiB of this process by kind."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return {line.split(":")[0]: int(line.split()[1]) / 1024 for line in lines if line.startswith(("Rss", "Vm"))}
 
 

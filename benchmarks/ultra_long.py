@@ -140,7 +140,7 @@ def looks(scene: Scene) -> str:
 
 def resident() -> int:
     """Bytes that this process holds now."""
-    with open("/proc/self/statm") as file:
+    with open("/proc/self/statm", encoding="utf-8") as file:
         return int(file.read().split()[1]) * resource.getpagesize()
 
 

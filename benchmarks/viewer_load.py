@@ -70,7 +70,7 @@ def crowd(people: int, frames: int) -> Scene:
 
 def memory() -> float:
     """Megabytes of this process in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * 4096 / 1e6
 
 
 class Listener(threading.Thread):

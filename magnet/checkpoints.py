@@ -189,7 +189,7 @@ def verify(path: Path) -> None:
     """
     beside = checksum_file(path)
     if path.is_file() and beside.is_file():
-        match = re.match(r"[0-9a-f]{64}(?![0-9a-f])", beside.read_text(errors="replace"))
+        match = re.match(r"[0-9a-f]{64}(?![0-9a-f])", beside.read_text(errors="replace", encoding="utf-8"))
         if match is None:
             raise ValueError(f"{beside}: holds no SHA-256; copy it again, or delete it to load {path.name} without")
         if file_hash(path) != match[0]:

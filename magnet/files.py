@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -175,9 +176,33 @@ def write_whole(
     return called, digest
 
 
+class Taken(OSError):
+    """Another process holds a lock."""
+
+
+@contextmanager
+def alone(lock: Path, taken: str) -> Iterator[None]:
+    """Hold a lock meanwhile, which goes with the process, however it ends. taken: the message where another has it
+
+    Raises:
+        Taken: another process has it.
+    """
+    try:
+        held = FileLock(lock, timeout=0).acquire()
+    except Timeout as error:
+        raise Taken(taken) from error
+    with held:
+        yield
+
+
 def sync(path: Path) -> None:
     """Write a file, or the renames in a folder, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # which Windows does not open, and whose renames it keeps by itself
+            return
+        raise
     try:
         os.fsync(handle)
     finally:

@@ -72,20 +72,20 @@ def manifest() -> dict[str, str]:
         | {f"61_{take}.amc" for take in HELD_OUT}
         | {"02_03.amc", "05_12.amc", "135_08.amc"}
     )
-    lines = (line.split() for line in RECORDINGS.read_text().splitlines())
+    lines = (line.split() for line in RECORDINGS.read_text(encoding="utf-8").splitlines())
     return {name: digest for digest, name in lines if name not in held and re.split(r"[._]", name)[0] in SUBJECTS}
 
 
 def run_of(key: str, checkpoint: Path | None) -> dict[str, Any]:
     """How a checkpoint came about, where its run's record still lies beside it."""
     record = checkpoint.resolve().parent.parent / "run.json" if checkpoint else None
-    return {key: json.loads(record.read_text())} if record and record.exists() else {}
+    return {key: json.loads(record.read_text(encoding="utf-8"))} if record and record.exists() else {}
 
 
 def decoder_kept(state: dict[str, Tensor], replaced: Path) -> dict[str, Any]:
     """The record of the decoder's run in a released folder, where its decoder is the checkpoint's; else nothing."""
     said = replaced / "config.json"
-    record = json.loads(said.read_text())["about"].get("decoder run") if said.is_file() else None
+    record = json.loads(said.read_text(encoding="utf-8"))["about"].get("decoder run") if said.is_file() else None
     if record is None:
         return {}
     before = checkpoints.read(replaced)["state_dict"]

@@ -60,7 +60,7 @@ class FencedExamples(griffe.Extension):
 
 def on_config(config: Any) -> Any:
     """List the pages of the API, which are as many as there are rooms, and at the end pages that have no place yet."""
-    said = (ROOT / "mkdocs.yml").read_text()
+    said = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for entry in config.nav:
         if isinstance(entry, dict) and "Project" in entry:
             entry["Project"] += [p.name for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in said]
@@ -79,11 +79,15 @@ def on_files(files: Any, config: Any) -> Any:
 
     brought: dict[str, bytes] = {}
     for source, uri in ELSEWHERE.items():
-        text = notebook(ROOT / source, brought) if source.endswith(".ipynb") else (ROOT / source).read_text()
+        text = (
+            notebook(ROOT / source, brought)
+            if source.endswith(".ipynb")
+            else (ROOT / source).read_text(encoding="utf-8")
+        )
         text = moved(text, source, uri, brought)
         add(uri, text + players(brought) if uri == "index.md" else text)
     for path in sorted((ROOT / "docs").glob("*.md")):
-        moved(path.read_text(), f"docs/{path.name}", path.name, brought)  # what its links bring along
+        moved(path.read_text(encoding="utf-8"), f"docs/{path.name}", path.name, brought)  # what its links bring along
     for uri, text in reference():
         add(uri, text)
     for uri, data in brought.items():
@@ -97,7 +101,7 @@ def on_page_read_source(page: Any, config: Any) -> str | None:
     if source is None or not Path(source).is_relative_to(ROOT / "docs"):
         return None
     name = Path(source).relative_to(ROOT).as_posix()
-    return moved(Path(source).read_text(), name, page.file.src_uri, {})
+    return moved(Path(source).read_text(encoding="utf-8"), name, page.file.src_uri, {})
 
 
 def moved(text: str, source: str, uri: str, brought: dict[str, bytes]) -> str:
@@ -139,7 +143,7 @@ def players(brought: dict[str, bytes]) -> str:
 def page_of(scene: Any) -> str:
     """The page that plays a scene."""
     with tempfile.TemporaryDirectory() as folder:
-        return Path(scene.save(Path(folder) / "scene.html", style="light")).read_text()
+        return Path(scene.save(Path(folder) / "scene.html", style="light")).read_text(encoding="utf-8")
 
 
 def frame(page: str, target: str, uri: str, brought: dict[str, bytes]) -> str:
@@ -153,7 +157,7 @@ def frame(page: str, target: str, uri: str, brought: dict[str, bytes]) -> str:
 
 def notebook(path: Path, brought: dict[str, bytes]) -> str:
     """A notebook as a page. The tour is run for it and shows its outputs; others need recordings of one's own."""
-    cells = json.loads(path.read_text())["cells"]
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     runs, parts, space = path.stem == "tour", [], {"__name__": "__main__"}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for number, cell in enumerate(cells):
@@ -190,7 +194,7 @@ def reference() -> Iterator[tuple[str, str]]:
         modules = sorted(package.glob("*.py")) if package.is_dir() else [package.with_suffix(".py")]
         dotted = (".".join(path.relative_to(ROOT).with_suffix("").parts) for path in modules if public(path))
         names = [name.removesuffix(".__init__") for name in dotted]
-        first = (ast.get_docstring(ast.parse(modules[0].read_text())) or "").partition("\n")[0]
+        first = (ast.get_docstring(ast.parse(modules[0].read_text(encoding="utf-8"))) or "").partition("\n")[0]
         intro.append(f"- [magnet.{room}]({room}.md): {first}")
         yield f"api/{room}.md", f"# magnet.{room}\n\n{first}\n\n" + "\n\n".join(f"::: {name}" for name in names) + "\n"
     yield "api/index.md", "\n".join(intro) + "\n"
@@ -198,6 +202,6 @@ def reference() -> Iterator[tuple[str, str]]:
 
 def public(path: Path) -> bool:
     """Whether a module defines a class or function that is not private."""
-    tree = ast.parse(path.read_text())
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     kinds = (ast.ClassDef, ast.FunctionDef)
     return any(isinstance(node, kinds) and not node.name.startswith("_") for node in tree.body)

@@ -11,7 +11,6 @@ that has its steps is not run again. `--steps tokenizer=2 denoiser=2 ...`, with 
 from __future__ import annotations
 
 import argparse
-import fcntl
 import shlex
 import sys
 import time
@@ -23,6 +22,7 @@ import yaml
 from magnet import checkpoints
 from magnet.callbacks.narrow_codes import NAME as NARROW
 from magnet.cli.child import run_to_its_end
+from magnet.files import Taken, alone
 
 ROOT = Path(__file__).resolve().parents[1]
 Shares = dict[str, int]
@@ -172,7 +172,10 @@ def wished_steps(changes: list[str]) -> dict[str, int]:
     Raises:
         ValueError: no such stage, or no number.
     """
-    steps = {stage: int(yaml.safe_load(config_of(stage).read_text())["trainer"]["max_steps"]) for stage in STAGES}
+    steps = {
+        stage: int(yaml.safe_load(config_of(stage).read_text(encoding="utf-8"))["trainer"]["max_steps"])
+        for stage in STAGES
+    }
     for change in changes:
         stage, _, count = change.partition("=")
         if stage not in steps or not count.isdigit() or not int(count):
@@ -212,12 +215,11 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error(str(error))
     out = given.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    with (out / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise SystemExit(f"{out}: another train_duet.py is at work in it") from None
-        train(given, out, steps)
+    try:
+        with alone(out / ".lock", f"{out}: another train_duet.py is at work in it"):
+            train(given, out, steps)
+    except Taken as error:
+        raise SystemExit(str(error)) from None
 
 
 def train(given: Any, out: Path, steps: dict[str, int]) -> None:

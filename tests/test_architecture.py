@@ -26,7 +26,7 @@ def modules(package: Path) -> dict[str, Path]:
 def imports(module: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
     """Modules of ours that a module imports, wherever in it: in functions and under TYPE_CHECKING too."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in known)
         elif isinstance(node, ast.ImportFrom):

@@ -58,7 +58,7 @@ def relative(path: Path) -> str:
 
 @functools.cache
 def written(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text())
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 def said(path: Path) -> dict[str, Any]:
@@ -176,7 +176,7 @@ def layers(path: Path) -> list[Any]:
 
 @pytest.mark.parametrize("path", sorted(PAPER.rglob("*.yaml")), ids=relative)
 def test_a_configuration_of_the_paper_says_what_it_needs_and_costs(path: Path) -> None:
-    head = " ".join(line.lstrip("# ") for line in path.read_text().splitlines() if line.startswith("#"))
+    head = " ".join(line.lstrip("# ") for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("#"))
     assert "Needs" in head and ("cost" in head.lower() or path.parent.name == "data")
     assert "Table" in head or not path.stem.startswith("table")
 

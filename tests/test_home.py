@@ -27,7 +27,7 @@ EXTRAS = set(PROJECT["optional-dependencies"])
 
 
 def jobs(workflow: Path) -> dict[str, Any]:
-    return yaml.safe_load(workflow.read_text())["jobs"]
+    return yaml.safe_load(workflow.read_text(encoding="utf-8"))["jobs"]
 
 
 def lines(workflow: Path) -> list[str]:

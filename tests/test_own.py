@@ -76,7 +76,7 @@ def test_the_commands_of_the_page_lead_from_two_files_to_a_film(tmp_path: Path, 
     said = capsys.readouterr().out
     assert "1 scene of 2 files: dance (A, B)" in said and "cm, +z up, 120 fps" in said and "all assertions hold" in said
     assert Path("bvh_check.png").stat().st_size > 10_000
-    manifest = json.loads(Path("store/manifest.json").read_text())
+    manifest = json.loads(Path("store/manifest.json").read_text(encoding="utf-8"))
     assert {split: facts["takes"] for split, facts in manifest["splits"].items()} == dict.fromkeys(
         manifest["splits"], 1
     )

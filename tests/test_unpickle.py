@@ -82,7 +82,7 @@ class Spy:
 
 
 def ran(path: str) -> None:
-    Path(path).write_text("ran")
+    Path(path).write_text("ran", encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,10 @@ def test_no_class_name_exists_twice():
 @functools.cache
 def tokens(path: Path) -> list[tuple[int, str]]:
     """Kind and text of each word of a source file."""
-    return [(token.type, token.string) for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline)]
+    return [
+        (token.type, token.string)
+        for token in tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+    ]
 
 
 def texts(path: Path) -> Iterator[str]:

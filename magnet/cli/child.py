@@ -7,11 +7,9 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-PASSED_ON: dict[int, int] = {
-    signal.SIGINT: signal.SIGINT,
-    signal.SIGTERM: signal.SIGTERM,
-    signal.SIGHUP: signal.SIGTERM,
-}
+PASSED_ON: dict[int, int] = {signal.SIGINT: signal.SIGINT, signal.SIGTERM: signal.SIGTERM}
+if hasattr(signal, "SIGHUP"):  # not on Windows
+    PASSED_ON[signal.SIGHUP] = signal.SIGTERM
 """What who waits gets, and what it sends on: where a terminal is closed, a command is to save before it ends."""
 
 

@@ -68,7 +68,7 @@ def read_yaml(file: str) -> dict[str, Any]:
             hint = "; configs/ is in a clone of the repository: run it there, or name the file's path in it"
         raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CommandError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):

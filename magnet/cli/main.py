@@ -13,7 +13,7 @@ from types import FrameType
 
 from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
-from magnet.cli.pipes import CLOSED, output_closed
+from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
 from magnet.errors import Stopped
 from magnet.version import __version__
 
@@ -68,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code: 0, 2 where the user can put it right, or 141 where its output was closed before the end.
     """
+    take_any_letter(sys.stdout, sys.stderr)
     try:
         code = answered(arguments)
         print(end="", flush=True)  # here, for what fails once Python ends is told with a traceback

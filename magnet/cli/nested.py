@@ -38,7 +38,9 @@ def place_of(layers: Sequence[str], field: str, got: str | None = None) -> tuple
 
 def _read(layer: str) -> Any:
     try:
-        return yaml.safe_load(Path(layer).read_text() if "\n" not in layer and Path(layer).is_file() else layer)
+        return yaml.safe_load(
+            Path(layer).read_text(encoding="utf-8") if "\n" not in layer and Path(layer).is_file() else layer
+        )
     except (OSError, ValueError, yaml.YAMLError):
         return None
 

@@ -84,9 +84,9 @@ def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
     values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
     folder.mkdir(parents=True, exist_ok=True)
     plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
-    (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n")
+    (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
     lines = ["metric,value", *(f"{name},{value!r}" for name, value in values.items())]
-    (folder / "results.csv").write_text("\n".join(lines) + "\n")
+    (folder / "results.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
     for name, value in values.items():
         table.add_row(name, f"{value:.6g}")
@@ -118,7 +118,7 @@ def write_scenes(
                 pictured.append(contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
     facts = evaluator.facts() | provenance() | {"machine": machine()}
-    (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n")
+    (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n", encoding="utf-8")
     for path in pictured:
         print("written:", path)
     print(cost(facts["sampling"]))

@@ -1,14 +1,22 @@
-"""What becomes of a command whose output nobody reads any more, such as behind `| head`."""
+"""Where a command's output goes: a pipe that nobody reads any more, such as `| head`, or one without some letters."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import select
 import sys
 
 CLOSED = 141
 """The exit code of a command that stopped because its output was closed: 128 + SIGPIPE."""
+
+
+def take_any_letter(*streams: object) -> None:
+    """Write a question mark for letters that a stream does not know, such as arrows in a file on Windows."""
+    for stream in streams:
+        if isinstance(stream, io.TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
+            stream.reconfigure(errors="replace")
 
 
 def output_closed() -> bool:

@@ -308,8 +308,10 @@ class Record(Callback):
                     (self.folder / f"{name}.{suffix}").replace(self.folder / f"{name}-{before}.{suffix}")
         # What is measured in a training's folder is recorded beside the training, which goes on as it was.
         own = f"-{self.command}" if self.command != "fit" and (self.folder / "checkpoints").is_dir() else ""
-        (self.folder / f"config{own}.yaml").write_text(self.config)
-        (self.folder / f"run{own}.json").write_text(json.dumps(provenance() | self.facts, indent=2) + "\n")
+        (self.folder / f"config{own}.yaml").write_text(self.config, encoding="utf-8")
+        (self.folder / f"run{own}.json").write_text(
+            json.dumps(provenance() | self.facts, indent=2) + "\n", encoding="utf-8"
+        )
 
     on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
 
@@ -327,6 +329,10 @@ class Record(Callback):
             point(self.folder.with_name(LATEST), self.folder)
 
 
+UNLINKED: set[Path] = set()
+"""Links that the file system did not take."""
+
+
 def point(link: Path, folder: Path) -> None:
     """Make `link` a symbolic link to `folder` beside it; say so where the file system allows none."""
     if link.exists() and not link.is_symlink():
@@ -337,4 +343,6 @@ def point(link: Path, folder: Path) -> None:
         part.symlink_to(folder.name, target_is_directory=True)
         part.replace(link)
     except OSError as error:
-        print(f"magnet: no link {link}: {error}", file=sys.stderr)
+        if link not in UNLINKED:  # once, and not at every checkpoint
+            print(f"magnet: no link {link}: {error}", file=sys.stderr)
+        UNLINKED.add(link)

@@ -27,7 +27,7 @@ class Curves(CSVLogger):
             writer: Any = super().experiment
             if before.is_file():
                 before.replace(file)
-                with file.open(newline="") as rows:
+                with file.open(newline="", encoding="utf-8") as rows:
                     writer.metrics_keys = next(csv.reader(rows), [])
         return self._experiment
 

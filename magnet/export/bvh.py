@@ -75,7 +75,9 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
             for place, angles in zip(position, degrees, strict=True)
         ]
         tips = {joint: PER_METRE[unit] * np.array(tip) for joint, tip in TIPS.items()}
-        each.write_text(bvh_text(bone_names(names), PARENTS, offsets, tips, ROTATIONS, rows, scene.fps))
+        each.write_text(
+            bvh_text(bone_names(names), PARENTS, offsets, tips, ROTATIONS, rows, scene.fps), encoding="utf-8"
+        )
         written.append(each)
     return written
 

@@ -27,7 +27,7 @@ def save_csv(scene: Scene, path: str | Path, body: Body) -> Path:
     """
     path = Path(path) if Path(path).suffix.lower() == ".csv" else Path(path).with_suffix(".csv")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
         for b in range(scene.scenes):

@@ -28,7 +28,7 @@ def start(host: str, port: int, title: str) -> Any:
     viser = require_viser()
     port = free_port(host, port)
     # viser greets with a box of its own; ours says more.
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if server.get_port() != port:
         server.stop()

@@ -111,7 +111,9 @@ def sharded(rank: int, world: int, folder: str) -> None:
         losses.append(float(total) / world)
     every = list(network.parameters())
     held = sum(weight.to_local().numel() for weight in every) / sum(weight.numel() for weight in every)
-    Path(folder, f"sharded{world}.{rank}.json").write_text(json.dumps({"losses": losses, "held": held}))
+    Path(folder, f"sharded{world}.{rank}.json").write_text(
+        json.dumps({"losses": losses, "held": held}), encoding="utf-8"
+    )
     dist.destroy_process_group()
 
 

@@ -38,7 +38,7 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
 
 
 def written(path: Path, **options: Any) -> str:
-    path.write_text(yaml.safe_dump(options))
+    path.write_text(yaml.safe_dump(options), encoding="utf-8")
     return str(path)
 
 

@@ -280,7 +280,7 @@ def test_a_recording_too_short_to_hold_parts_out_is_no_broken_one(tmp_path, monk
         f"{name} is 3.0 s long; to hold out a part of 1 s it must be 10 s to validate and 3.4 s to test: record longer"
     )
     assert told in said.out and "skipped 2 takes" in said.out and "PROBLEM" not in said.err
-    Path("all.txt").write_text(f"{name} train\n")
+    Path("all.txt").write_text(f"{name} train\n", encoding="utf-8")
     assert cli.main([*check, "--splits", "all.txt"]) == 0
     assert "held out" not in capsys.readouterr().out
     file = min((tmp_path / "people").glob("*.bvh"))

@@ -179,7 +179,7 @@ WRONG = {
 @pytest.mark.parametrize("words", WRONG)
 def test_what_a_person_can_put_right_is_said_in_one_line(words, stored: Path, monkeypatch, capsys):
     monkeypatch.chdir(stored.parent)
-    Path("broken.bvh").write_text("no such thing")
+    Path("broken.bvh").write_text("no such thing", encoding="utf-8")
     assert cli.main(["export", *words]) == 2
     error = capsys.readouterr().err
     assert re.search(WRONG[words], error) and error.count("\n") == 1

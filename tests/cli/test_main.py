@@ -284,7 +284,7 @@ def test_our_own_faults_are_not_hidden(toy: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]), ids=lambda page: page.name)
 def test_every_training_that_a_page_names_says_what_is_trained(page: Path) -> None:
-    for line in re.findall(r"^ {4}(magnet fit .*)", page.read_text(), re.MULTILINE):
+    for line in re.findall(r"^ {4}(magnet fit .*)", page.read_text(encoding="utf-8"), re.MULTILINE):
         assert "--config" in line or "--model " in line, line
 
 

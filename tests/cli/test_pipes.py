@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from magnet.cli import run_folder
-from magnet.cli.pipes import CLOSED, output_closed
+from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
 
 ROOT = Path(__file__).parents[2]
 SHOWS = """
@@ -75,3 +76,13 @@ def test_a_run_goes_on_where_nobody_reads_its_progress(monkeypatch: pytest.Monke
             lines.tell("test: denoising step", done, 3)
         print("the table", flush=True)
         assert not output_closed()  # it leads nowhere now
+
+
+def test_letters_that_a_stream_does_not_know_are_question_marks() -> None:
+    narrow, wide = (io.TextIOWrapper(io.BytesIO(), encoding=name) for name in ("cp1252", "utf-8"))
+    take_any_letter(narrow, wide, None)
+    for stream in (narrow, wide):
+        stream.write("FD \u2193 \u00e9")
+        stream.flush()
+    assert narrow.buffer.getvalue() == b"FD ? \xe9"
+    assert wide.buffer.getvalue() == "FD \u2193 \u00e9".encode()

@@ -165,12 +165,12 @@ def test_the_picture_leaves_out_frames_that_are_not_valid(crowded: Scene) -> Non
 
 
 def _bones(path: Path) -> list[str]:
-    return re.findall(r"(?:ROOT|JOINT) (\w+)", path.read_text())
+    return re.findall(r"(?:ROOT|JOINT) (\w+)", path.read_text(encoding="utf-8"))
 
 
 def _renamed(path: Path) -> Path:
     """The same skeleton with bones of names that say nothing."""
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     for number, name in enumerate(_bones(path)):
         text = re.sub(rf"\b{name}\b", f"Bone{number:02}", text)
     strange = path.with_name(f"strange_{path.name}")

@@ -26,7 +26,7 @@ def fit(*words: str) -> list[Any]:
 
 
 def rows(file: Path) -> list[str]:
-    with file.open(newline="") as text:
+    with file.open(encoding="utf-8", newline="") as text:
         return [row["step"] for row in csv.DictReader(text)]
 
 

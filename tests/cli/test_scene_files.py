@@ -231,7 +231,7 @@ def test_a_place_that_takes_no_file_is_said_before_anything_is_made(
 ) -> None:
     monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
     monkeypatch.setattr("magnet.body.repair.repaired", lambda *_, **__: pytest.fail("computed"))
-    Path("file").write_text("no folder")
+    Path("file").write_text("no folder", encoding="utf-8")
     names = [word.replace("OUT", "file/out") for word in words]
     assert "file is a file, expected a folder" in refused(capsys, *names)
     if words[0] != "demo":

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 def slow_ends(asf: Path, amc: Path, frame: int) -> dict[str, NDArray[np.float64]]:
     """Bone ends of one frame in metres, by matrices and scipy, from the files' text alone."""
-    skeleton = asf.read_text().replace("\r", "")
+    skeleton = asf.read_text(encoding="utf-8").replace("\r", "")
     bone_text = {
         block.split("name ")[1].split()[0]: block
         for block in skeleton.split(":bonedata")[1].split(":hierarchy")[0].split("begin")[1:]
@@ -20,7 +20,7 @@ def slow_ends(asf: Path, amc: Path, frame: int) -> dict[str, NDArray[np.float64]
     for line in skeleton.split(":hierarchy")[1].splitlines():
         words = line.split()
         tree.update({child: words[0] for child in words[1:]} if words and words[0] not in ("begin", "end") else {})
-    wanted = amc.read_text().replace("\r", "").split(f"\n{frame + 1}\n")[1].splitlines()
+    wanted = amc.read_text(encoding="utf-8").replace("\r", "").split(f"\n{frame + 1}\n")[1].splitlines()
     angles = {}
     for line in wanted:
         if line.strip().isdigit():

@@ -42,7 +42,7 @@ def opened(path: Path) -> Any:
     if path.suffix == ".pkl":
         return pickle.loads(path.read_bytes())
     if path.suffix == ".json":
-        return {key: np.array(value) for key, value in json.loads(path.read_text()).items()}
+        return {key: np.array(value) for key, value in json.loads(path.read_text(encoding="utf-8")).items()}
     held = np.load(path, allow_pickle=True)
     return dict(held) if path.suffix == ".npz" else held.item() if held.dtype == object else held
 
@@ -51,7 +51,7 @@ def saved(path: Path, held: Any) -> None:
     if path.suffix == ".pkl":
         path.write_bytes(pickle.dumps(held))
     elif path.suffix == ".json":
-        path.write_text(json.dumps({key: value.tolist() for key, value in held.items()}))
+        path.write_text(json.dumps({key: value.tolist() for key, value in held.items()}), encoding="utf-8")
     elif path.suffix == ".npz":
         np.savez(path, **held)
     else:

@@ -43,9 +43,9 @@ def test_the_root_may_be_the_folder_itself(root: Path) -> None:
 
 def change(what: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
-        held = json.loads(path.read_text())
+        held = json.loads(path.read_text(encoding="utf-8"))
         changed = what(held)
-        path.write_text(json.dumps(held if changed is None else changed))
+        path.write_text(json.dumps(held if changed is None else changed), encoding="utf-8")
 
     return damage
 

@@ -99,13 +99,14 @@ def test_a_mixed_model_is_tested_on_scenes_of_each_size(tmp_path, monkeypatch, c
         words = ("--root", "dl", "--out", f"of{people}", "--workers", "1", "--reader.people", f"[{people}]")
         magnet("data", "prepare", "embody3d", *words, *body)
     held = [
-        json.loads(Path(f"of{people}/manifest.json").read_text())["splits"]["test"]["takes"] for people in (2, 3, 4)
+        json.loads(Path(f"of{people}/manifest.json").read_text(encoding="utf-8"))["splits"]["test"]["takes"]
+        for people in (2, 3, 4)
     ]
     assert sum(held) == mixed["splits"]["test"]["takes"]
     people = 2 + next(k for k, takes in enumerate(held) if takes)
     data = ("--data", "Embody3D", "--data.path", f"of{people}")
     magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", *data, "--out", "each", *CPU)
-    assert json.loads(Path("each/results.json").read_text())
+    assert json.loads(Path("each/results.json").read_text(encoding="utf-8"))
 
 
 def prepare_fit_and_test(name, body, options, capsys):
@@ -114,13 +115,13 @@ def prepare_fit_and_test(name, body, options, capsys):
     assert f"--data {registry.data_of(registry.reader(name))} --data.path store" in capsys.readouterr().out
     magnet("data", "check", "store", "--picture", "none", *body)
     assert "all assertions hold" in capsys.readouterr().out
-    manifest = json.loads(Path("store/manifest.json").read_text())
+    manifest = json.loads(Path("store/manifest.json").read_text(encoding="utf-8"))
     assert manifest["skipped"] == [] and all(manifest["splits"][split]["clips"] for split in ("train", "val", "test"))
     body_model = ("--data.body_model", body[1]) if body else ()
     kind = registry.classes()[registry.data_of(registry.reader(name))]
     fit_and_test("--data", kind.__name__, "--data.path", "store", *body_model)  # the documented command
     largest = max(int(people) for split in manifest["splits"].values() for people in split["clips by people"])
-    options = yaml.safe_load(Path("run/config.yaml").read_text())["data"]["init_args"]
+    options = yaml.safe_load(Path("run/config.yaml").read_text(encoding="utf-8"))["data"]["init_args"]
     defaults = [inspect.signature(one.__init__).parameters for one in kind.__mro__ if "__init__" in vars(one)]
     expected = {
         key: next(each[key].default for each in defaults if key in each) for key in ("max_agents", "device_resident")
@@ -136,7 +137,7 @@ def fit_and_test(*data: str) -> None:
     words = (*flags("model", TINY), *data, *flags("data", SMALL), "--out", "run", *limits)
     magnet("fit", "--model", "Tokenizer", *words, *CPU)
     magnet("test", "--ckpt_path", "run/checkpoints/last.ckpt", "--out", "tested", *CPU)
-    assert json.loads(Path("tested/results.json").read_text())
+    assert json.loads(Path("tested/results.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.slow

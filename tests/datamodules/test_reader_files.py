@@ -146,7 +146,7 @@ def test_a_users_list_needs_none_of_the_data_sets_own(
     used = {path for take in takes for path in take.files}
     for path in [path for path in Path(root).rglob("*") if path.suffix in (".txt", ".csv") and path not in used]:
         path.unlink()
-    Path("mine.txt").write_text(f"{takes[0].name} test\n")
+    Path("mine.txt").write_text(f"{takes[0].name} test\n", encoding="utf-8")
     body = ["--body", "dl/body.npz"] if Path("dl/body.npz").is_file() else []
     words = [*body, "--workers", "1", "--min_frames", "8"]
     prepared = ["data", "prepare", name, "--root", root, "--out", "store", *words]
@@ -157,6 +157,6 @@ def test_a_users_list_needs_none_of_the_data_sets_own(
         assert cli.main(prepared) == 2
         assert NO_LISTS[form] in (said := capsys.readouterr().err) and "--splits FILE" in said
     assert cli.main([*prepared, "--splits", "mine.txt"]) == 0
-    manifest = json.loads(Path("store/manifest.json").read_text())
+    manifest = json.loads(Path("store/manifest.json").read_text(encoding="utf-8"))
     assert {split: facts["takes"] for split, facts in manifest["splits"].items()} == {"train": 0, "val": 0, "test": 1}
     assert manifest["skipped"] == [] and manifest["splits by"] == "a list given by the user"

@@ -53,7 +53,7 @@ GENDERS = {
 @pytest.mark.parametrize("name", registry.readers())
 def test_messages_name_options_as_the_command_line_takes_them(name: str) -> None:
     reader = registry.reader(name)
-    text = Path(inspect.getsourcefile(reader) or "").read_text()
+    text = Path(inspect.getsourcefile(reader) or "").read_text(encoding="utf-8")
     assert set(re.findall(r"--reader\.(\w+)", text)) <= set(inspect.signature(reader).parameters)
     assert not re.search(r"give \w+=", text)
 

@@ -230,7 +230,7 @@ def test_every_data_error_says_what_to_do(path: Path) -> None:
     """Also those that no damage has brought about yet. What hands another's message on is held there."""
     module = ".".join(path.relative_to(Path(datamodules.__file__).parents[2]).with_suffix("").parts)
     names = vars(importlib.import_module(module.removesuffix(".__init__")))
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         call = node.exc if isinstance(node, ast.Raise) else None
         if isinstance(call, ast.Call) and ast.unparse(call.func) in ("DataError", "StoreError"):
             text = sentence(call.args[0], names)

@@ -35,13 +35,13 @@ def read(root: Path, number: int = 3, **options: Any) -> Recording:
 
 
 def table(path: Path) -> tuple[list[str], np.ndarray]:
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     return lines[0].split(","), np.array([[float(word) for word in line.split(",")] for line in lines[1:]])
 
 
 def write_table(path: Path, heading: list[str], values: np.ndarray) -> None:
     rows = [",".join(f"{x:.6f}" for x in row) for row in values]
-    path.write_text("\n".join([",".join(heading), *rows]) + "\n")
+    path.write_text("\n".join([",".join(heading), *rows]) + "\n", encoding="utf-8")
 
 
 def test_the_fakes_csv_has_the_order_of_the_authors_code(made: Path) -> None:
@@ -177,13 +177,13 @@ def test_another_rate_of_the_bvh_is_taken_with_a_note(copy: Path) -> None:
 
 
 def edited(path: Path, old: str, new: str, count: int = -1) -> None:
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     assert old in text
-    path.write_text(text.replace(old, new, count))
+    path.write_text(text.replace(old, new, count), encoding="utf-8")
 
 
 def shortened(path: Path, lines: int) -> None:
-    path.write_text("\n".join(path.read_text().splitlines()[:-lines]) + "\n")
+    path.write_text("\n".join(path.read_text(encoding="utf-8").splitlines()[:-lines]) + "\n", encoding="utf-8")
 
 
 @pytest.mark.parametrize(

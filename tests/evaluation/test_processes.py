@@ -26,7 +26,9 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
     trainer = L.Trainer(accelerator="cpu", devices=2, strategy="ddp", **quiet)
     evaluation, _ = prepared(baselines=False)
     trainer.test(evaluation, datamodule=data(), verbose=False)
-    Path(folder, f"{rank}.json").write_text(json.dumps([evaluation.results.meta, evaluation.results.rows[MODEL]]))
+    Path(folder, f"{rank}.json").write_text(
+        json.dumps([evaluation.results.meta, evaluation.results.rows[MODEL]]), encoding="utf-8"
+    )
 
 
 @pytest.mark.slow

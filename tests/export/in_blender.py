@@ -45,7 +45,9 @@ def seen(first: int, frames: list[int]) -> dict:
 def main() -> None:
     path, out, frames = sys.argv[1:]
     opened(path)
-    Path(out).write_text(json.dumps(seen(0 if path.endswith(".glb") else 1, [int(f) for f in frames.split(",")])))
+    Path(out).write_text(
+        json.dumps(seen(0 if path.endswith(".glb") else 1, [int(f) for f in frames.split(",")])), encoding="utf-8"
+    )
 
 
 main()

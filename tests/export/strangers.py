@@ -89,7 +89,7 @@ def write(
                 row.extend(offsets[k])
             row.extend(angles[t, k])
         lines.append(" ".join(f"{v:.5f}" for v in row))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 

@@ -115,7 +115,8 @@ def walker(path: Path, offset: np.ndarray, channels: np.ndarray) -> Path:
         f"HIERARCHY\nROOT hip {{\nOFFSET {' '.join(map(str, offset))}\n"
         "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
         "JOINT foot\n{\nOFFSET 0 -90 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
-        f"End Site\n{{\nOFFSET 0 0 10\n}}\n}}\n}}\nMOTION\nFrames: {len(channels)}\nFrame Time: 0.1\n{rows}\n"
+        f"End Site\n{{\nOFFSET 0 0 10\n}}\n}}\n}}\nMOTION\nFrames: {len(channels)}\nFrame Time: 0.1\n{rows}\n",
+        encoding="utf-8",
     )
     return path
 

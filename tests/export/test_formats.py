@@ -152,7 +152,7 @@ def test_a_new_format_is_a_function_and_a_line(duet, tmp_path, body, monkeypatch
 
     def save_way(scene: Scene, path: Path, options: formats.WriteOptions) -> list[Path]:
         ground = scene.T_world_root[..., [0, 2], 3].diff(dim=1).norm(dim=-1).sum(dim=1)
-        path.write_text("".join(f"{metres:.3f}\n" for metres in ground[0].tolist()))
+        path.write_text("".join(f"{metres:.3f}\n" for metres in ground[0].tolist()), encoding="utf-8")
         return [path]
 
     monkeypatch.setitem(formats.WRITTEN, ".way", formats.Format(save_way))

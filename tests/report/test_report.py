@@ -200,7 +200,7 @@ def test_a_report_on_other_recordings_trains_on_them_by_windows_that_a_peer_need
     Path("data.yaml").write_text(DUOBOX, encoding="utf-8")
     words = ["--budget", "tiny", "--data", "data.yaml", "--configs", ".", "--out", "out"]
     assert cli.main(["report", "2", *words, "--only", "remos-partner_inpainting-data-seed0"]) == 0
-    rows = json.loads(Path("out/report.json").read_text())["tables"]["2"][0]["rows"]
+    rows = json.loads(Path("out/report.json").read_text(encoding="utf-8"))["tables"]["2"][0]["rows"]
     assert rows["ReMoS"]["mpjpe"]["value"] > 0
     (run_config,) = Path("out/trainings").glob("*/config.yaml")
     trained = yaml.safe_load(run_config.read_text())["data"]

@@ -23,7 +23,7 @@ def rates(out: str, steps: int, *words: str) -> dict[int, float]:
     flags = [word for name, value in FLAGS.items() for word in (f"--{name}", str(value))]
     run = ["fit", "--model", "Tokenizer", "--data", "Synthetic", "--out", out, "--trainer.max_steps", str(steps)]
     assert cli.main([*run, *flags, *words]) == 0
-    with Path(out, "metrics.csv").open(newline="") as rows:
+    with Path(out, "metrics.csv").open(encoding="utf-8", newline="") as rows:
         return {int(row["step"]): float(row["lr-AdamW"]) for row in csv.DictReader(rows) if row["lr-AdamW"]}
 
 

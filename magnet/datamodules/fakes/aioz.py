@@ -31,7 +31,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
         (out / "motions_smpl" / f"{name}.pkl").write_bytes(pickle.dumps(held))
         lists[SPLITS[index % len(SPLITS)]].append(name)
     for split, names in lists.items():
-        (out / f"{split}_split_sequence_names.txt").write_text("".join(f"{name}\n" for name in names))
+        (out / f"{split}_split_sequence_names.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

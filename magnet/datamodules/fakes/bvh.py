@@ -44,7 +44,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
     write_body(out / "body.npz")
     for name, shown in scenes.items():
         for person in range(shown.poses.shape[1]):
-            (out / f"{name}_{chr(ord('A') + person)}.bvh").write_text(_file(shown, person))
+            (out / f"{name}_{chr(ord('A') + person)}.bvh").write_text(_file(shown, person), encoding="utf-8")
 
 
 def _file(shown: FakeMotion, person: int) -> str:

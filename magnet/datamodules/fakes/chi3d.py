@@ -29,7 +29,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
         pair, action = name.split("_")
         path = out / "chi3d" / "train" / pair / "smplx" / f"{action}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(_held(motion)))
+        path.write_text(json.dumps(_held(motion)), encoding="utf-8")
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

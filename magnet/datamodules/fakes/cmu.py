@@ -86,7 +86,7 @@ def write_asf(path: Path) -> Path:
     lines += [":hierarchy", "  begin"]
     parents = dict.fromkeys(parent for _, parent, *_ in bones())
     lines += ["    " + " ".join([up, *(name for name, parent, *_ in bones() if parent == up)]) for up in parents]
-    path.write_text("\r\n".join([*lines, "  end", ""]))
+    path.write_text("\r\n".join([*lines, "  end", ""]), encoding="utf-8")
     return path
 
 
@@ -103,5 +103,5 @@ def write_amc(path: Path, frames: int, x: float = 0.0, seed: int = 0, swing: flo
             if name == "root":
                 values = np.concatenate([[x / 0.0254 * 0.45, 17.0, 0.0], 0.3 * values[3:]])
             lines.append(" ".join([name, *(f"{value:.6g}" for value in values)]))
-    path.write_text("\r\n".join([*lines, ""]))
+    path.write_text("\r\n".join([*lines, ""]), encoding="utf-8")
     return path

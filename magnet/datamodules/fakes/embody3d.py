@@ -42,7 +42,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
     for section, subjects in listed.items():
         path = out / "datasets" / section / "dataset.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(subjects, indent=4))
+        path.write_text(json.dumps(subjects, indent=4), encoding="utf-8")
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

@@ -27,11 +27,11 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
         held: dict[str, Any] = {"mocap_framerate": RATE, "frames": motion.frames}
         held |= {f"person{p + 1}": _person(motion, p) for p in range(2)}
         (out / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(held))
-        (out / "annots" / f"{name}.txt").write_text("one person walks behind the other\n")
+        (out / "annots" / f"{name}.txt").write_text("one person walks behind the other\n", encoding="utf-8")
         lists[SPLITS[index % len(SPLITS)]].append(name)
     for split, names in lists.items():
-        (out / "split" / f"{split}.txt").write_text("".join(f"{name}\n" for name in names))
-    (out / "split" / "ignore_list.txt").write_text("")
+        (out / "split" / f"{split}.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+    (out / "split" / "ignore_list.txt").write_text("", encoding="utf-8")
 
 
 def scenes(takes: int, frames: int, seed: int) -> dict[str, FakeMotion]:

@@ -44,8 +44,8 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
         (out / part).mkdir(parents=True, exist_ok=True)
     listed = list(scenes)
     for k, split in enumerate(SPLITS):
-        (out / "splits" / f"{split}.txt").write_text("".join(f"{clip}\n" for clip in listed[k::3]))
-    (out / "splits" / "all.txt").write_text("".join(f"{clip}\n" for clip in listed))
+        (out / "splits" / f"{split}.txt").write_text("".join(f"{clip}\n" for clip in listed[k::3]), encoding="utf-8")
+    (out / "splits" / "all.txt").write_text("".join(f"{clip}\n" for clip in listed), encoding="utf-8")
     (out / "annots" / "interaction_order.pkl").write_bytes(pickle.dumps({c: k % 2 for k, c in enumerate(listed)}))
     generator = np.random.default_rng(0)
     for clip, shown in scenes.items():

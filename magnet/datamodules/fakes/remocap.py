@@ -170,11 +170,11 @@ def _write_person(folder: Path, shown: FakeMotion, person: int) -> None:
     parents = [joints.index(above[name].name) if name in above else -1 for name in joints]
     tips = {joints.index(above[j.name].name): offsets[j.name] for j in declared if j.end}
     text = bvh_text(joints, parents, np.stack([offsets[name] for name in joints]), tips, CHANNELS, rows, RATE)
-    (folder / "motion.bvh").write_text(text)
+    (folder / "motion.bvh").write_text(text, encoding="utf-8")
 
 
 def _write_csv(path: Path, names: list[str], columns: dict[str, np.ndarray]) -> None:
     values = np.stack([columns[name] for name in names], axis=1).reshape(len(columns[names[0]]), -1)
     lines = [",".join(["Time", *(f"{name}.{axis}" for name in names for axis in "XYZ")])]
     lines += [",".join([f"{t / RATE:.6f}", *(f"{x:.6f}" for x in row)]) for t, row in enumerate(values.tolist())]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

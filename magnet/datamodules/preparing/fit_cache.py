@@ -133,7 +133,7 @@ class FitCache:
     def report(self, take: Take) -> dict[str, Any]:
         """The report on a take with these very files, or an "error"; empty while it has not been fitted."""
         report = self.file(take).with_suffix(".json")
-        return json.loads(report.read_text()) if report.exists() else {}
+        return json.loads(report.read_text(encoding="utf-8")) if report.exists() else {}
 
     def scene(self, take: Take) -> Scene | None:
         """The fitted take; None: it could not be used, or has not been fitted."""

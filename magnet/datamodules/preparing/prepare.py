@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import re
 from collections import Counter
@@ -24,7 +23,7 @@ from magnet.datamodules.preparing.convert import (
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
-from magnet.files import file_hash, write_whole, writing
+from magnet.files import alone, file_hash, write_whole, writing
 
 SHARD_ROWS = 2**18
 """Rows of a shard at most, 49 MB; small enough that ten million frames spread over some forty processes."""
@@ -250,13 +249,7 @@ def _whole(path: Path) -> bool:
 @contextmanager
 def locked(state: Path) -> Iterator[None]:
     """Nobody else prepares into the same folder meanwhile; the lock goes with the process, however it ends."""
-    with (state / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OSError(
-                f"another prepare is working in {state.parent}; wait for it, or choose another --out"
-            ) from error
+    with alone(state / "lock", f"another prepare is working in {state.parent}; wait for it, or choose another --out"):
         yield
 
 
@@ -266,7 +259,7 @@ def remembered(state: Path, old: StoreReader | None) -> dict[str, Any]:
     if old is None or not path.exists():
         return {}
     try:
-        found = json.loads(path.read_text())
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     if found.get("manifest") != file_hash(old.path / MANIFEST):

@@ -230,14 +230,14 @@ def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) 
 
 def _continue(url: str, part: Path, tag: Path, retries: Retries, progress: Progress | None) -> int | None:
     """Append what is missing of a file, or begin again if the site will not or has another file by now. -> all bytes"""
-    offset, known = _size(part), tag.read_text() if tag.exists() else ""
+    offset, known = _size(part), tag.read_text(encoding="utf-8") if tag.exists() else ""
     headers = {"Range": f"bytes={offset}-", "If-Range": known} if offset and known else {}
     try:
         with _open(url, headers, retries) as response:
             start, total = _extent(response.status, response.headers)
             if start not in (0, offset):
                 raise http.client.HTTPException(f"bytes from {start:,} came, from {offset:,} were asked for")
-            tag.write_text(_validator(response.headers))
+            tag.write_text(_validator(response.headers), encoding="utf-8")
             with part.open("ab" if start else "wb") as file:
                 while chunk := response.read(CHUNK):
                     file.write(chunk)

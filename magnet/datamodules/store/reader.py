@@ -203,7 +203,7 @@ class StoreReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).expanduser()
         try:
-            self.manifest: dict[str, Any] = json.loads((self.path / MANIFEST).read_text())
+            self.manifest: dict[str, Any] = json.loads((self.path / MANIFEST).read_text(encoding="utf-8"))
             version = self.manifest["format"]
         except FileNotFoundError as error:
             raise StoreError(
@@ -222,7 +222,7 @@ class StoreReader:
 
     @cached_property
     def _clips(self) -> dict[str, list[Any]]:
-        return self._load("clips", lambda path: json.loads(path.read_text()))
+        return self._load("clips", lambda path: json.loads(path.read_text(encoding="utf-8")))
 
     @cached_property
     def _betas(self) -> NDArray[np.float32]:

@@ -87,7 +87,9 @@ def doomed(order: PrepareJob, out: Path, during: str, workers: int, reached: Pat
 
 def children(pid: int) -> list[Path]:
     """Processes that a process started, in /proc."""
-    return [Path("/proc", child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [
+        Path("/proc", child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()
+    ]
 
 
 def until(true: Callable[[], bool], seconds: float = 500.0) -> None:
