@@ -51,13 +51,29 @@ def device_of(device: str | torch.device) -> torch.device:
     try:
         place = torch.device(device)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"device: got {device!r}, expected cpu, cuda, cuda:0 or mps") from error
+        raise ValueError(f"device: got {device!r}, expected cpu, cuda or cuda:0") from error
     if place.type == "meta":
-        raise ValueError(f"device: got {device!r}, which holds no numbers, expected cpu, cuda, cuda:0 or mps")
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not there.get(place.type, True):
+        raise ValueError(f"device: got {device!r}, which holds no numbers, expected cpu, cuda or cuda:0")
+    if place.type == "mps":
+        raise ValueError(f"device {device}: {APPLE}")
+    if place.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
     return place
+
+
+APPLE = "torch has no float64 on Apple's GPUs, in which places on the floor are computed; take cpu"
+
+
+def accelerator_of(asked: Any) -> Any:
+    """A Trainer's accelerator: on an Apple computer the processor, where nobody says what.
+
+    Raises:
+        ValueError: Apple's GPU is asked for.
+    """
+    apple = torch.backends.mps.is_available() and not torch.cuda.is_available()
+    if asked == "mps" or (asked == "gpu" and apple):
+        raise ValueError(f"trainer.accelerator {asked}: {APPLE}")
+    return "cpu" if apple and asked in (None, "auto") else asked
 
 
 def quick_bf16(device: torch.device) -> bool:
@@ -81,7 +97,6 @@ def quick_int8(device: torch.device) -> bool:
 
 def quick_precision(precision: Any, accelerator: Any) -> Any:
     """A Trainer's precision, float32 in place of `bf16-mixed` where only a CPU that emulates bfloat16 would train."""
-    elsewhere = accelerator == "auto" and (torch.cuda.is_available() or torch.backends.mps.is_available())
-    on_cpu = accelerator in ("auto", "cpu") and not elsewhere
+    on_cpu = accelerator == "cpu" or (accelerator == "auto" and not torch.cuda.is_available())
     slow = precision == "bf16-mixed" and on_cpu and not quick_bf16(torch.device("cpu"))
     return "32-true" if slow else precision

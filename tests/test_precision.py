@@ -18,7 +18,7 @@ from magnet.denoiser.module import Denoiser
 from magnet.export import save_bvh
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
-from magnet.precision import Float32, quick_precision
+from magnet.precision import Float32, accelerator_of, device_of, quick_precision
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
@@ -151,3 +151,16 @@ def test_another_default_dtype_of_torch_changes_nothing(tmp_path: Path, request:
     for was, now in zip(before, made_by(model, duet, bvh), strict=True):
         for name, value in now.tensors().items():
             assert value.dtype == getattr(was, name).dtype and torch.equal(value, getattr(was, name)), name
+
+
+def test_apples_gpu_which_has_no_float64_is_not_taken_by_itself_and_refused_if_asked_for(monkeypatch) -> None:
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert [accelerator_of(asked) for asked in (None, "auto", "cpu")] == ["cpu"] * 3
+    for asked in ("mps", "gpu"):
+        with pytest.raises(ValueError, match=f"accelerator {asked}: torch has no float64 on Apple's GPUs"):
+            accelerator_of(asked)
+    with pytest.raises(ValueError, match="device mps: torch has no float64 on Apple's GPUs"):
+        device_of("mps")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [accelerator_of(asked) for asked in ("auto", "gpu")] == ["auto", "gpu"]

@@ -33,7 +33,7 @@ from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
 from magnet.motion.scene import Scene
 from magnet.old_names import OPTIONS
-from magnet.precision import quick_precision
+from magnet.precision import accelerator_of, quick_precision
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
 from magnet.tasks import registry as task_registry
@@ -279,6 +279,7 @@ class MagnetCLI(LightningCLI):
             "logger": logger or False,
             "plugins": plugins,
             "precision": self._precision(config),
+            "accelerator": accelerator_of(config.get("accelerator") or "auto"),
             "default_root_dir": config.get("default_root_dir") or str(self.folder),
         }
         return self.trainer_class(**{**config, **changes, **kwargs})
