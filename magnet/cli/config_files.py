@@ -48,6 +48,7 @@ def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
     if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
         raise CommandError(f"{file}: {EXTENDS} is {named!r}, expected a file or a list of files")
     before = [layer for name in named for layer in read_layers(str(Path(file).parent / name), (*within, here))]
+    require_classes(file, options)
     options, changed = renamed_config(options)
     if changed:
         print(f"magnet: {file}: {told(changed)}", file=sys.stderr)
@@ -74,6 +75,22 @@ def read_yaml(file: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise CommandError(f"{file} holds {type(content).__name__}, expected options such as `model:` and `data:`")
     return content
+
+
+def require_classes(file: str, options: object, place: str = "") -> None:
+    """Refuse a class that is not named by a word, and options of one that are no options.
+
+    Raises:
+        CommandError: names the file and the place in it.
+    """
+    groups = options.items() if isinstance(options, dict) else enumerate(options) if isinstance(options, list) else ()
+    for key, value in groups:
+        where = f"{place}[{key}]" if isinstance(key, int) else f"{place}.{key}".lstrip(".")
+        if isinstance(options, dict) and key == "class_path" and not isinstance(value, str):
+            raise CommandError(f"{file}: {where} is {value!r}, expected the name of a class")
+        if isinstance(options, dict) and key == "init_args" and not isinstance(value, dict | None):
+            raise CommandError(f"{file}: {where} is {value!r}, expected options such as `seed: 1`")
+        require_classes(file, value, where)
 
 
 def with_presets(options: dict[str, Any]) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class SceneValues:
         """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
-            version, scenes, facts = content["format"], tuple(content["scenes"]), content["facts"]
+            version, scenes, facts = content["format"], tuple(map(str, content["scenes"])), content["facts"]
             units = tuple(map(int, content["units"]))
             rows = {m: {k: _read(v, len(scenes)) for k, v in row.items()} for m, row in content["rows"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -111,11 +111,11 @@ class Results:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
             version, meta, rows = content["format"], content["meta"], content["rows"]
             columns = {name: Column(**shown) for name, shown in content.get("columns", {}).items()}
-        except (ValueError, KeyError, TypeError) as error:
+            numbers = {m: {k: math.nan if v is None else float(v) for k, v in row.items()} for m, row in rows.items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not a results file ({error!r}); write one with Results.save_json") from error
         if version > RESULTS_FORMAT:
             raise ValueError(f"{path}: results format {version}, this version reads up to {RESULTS_FORMAT}")
-        numbers = {m: {k: math.nan if v is None else float(v) for k, v in row.items()} for m, row in rows.items()}
         return Results(numbers, meta, columns)
 
     def save_csv(self, path: str | Path) -> Path:

@@ -172,6 +172,12 @@ def test_files_that_cannot_be_extended_are_told(toy: Path, capsys: pytest.Captur
     assert "no configuration file nosuch.yaml" in complaint(capsys, "fit", "--config", "gone.yaml")
     assert "configs/ is in a clone of the repository" in complaint(capsys, "fit", "--config", "configs/finetune.yaml")
     assert "expected a file or a list of files" in complaint(capsys, "fit", "--config", "odd.yaml")
+    Path("number.yaml").write_text("model: {class_path: 3}", encoding="utf-8")
+    said = complaint(capsys, "fit", "--config", "number.yaml")
+    assert "number.yaml: model.class_path is 3, expected the name of a class" in said
+    Path("word.yaml").write_text("data: {class_path: Mixed, init_args: {data: [{init_args: a}]}}", encoding="utf-8")
+    said = complaint(capsys, "fit", "--config", "word.yaml")
+    assert "word.yaml: data.init_args.data[0].init_args is 'a', expected options such as" in said
 
 
 FORMS = {

@@ -80,6 +80,9 @@ def test_csv_returns_what_was_saved(results: Results, tmp_path: Path) -> None:
 
 
 def test_bad_files_and_metrics_are_named(results: Results, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"format": 1, "meta": {}, "rows": {"m": {"fd": []}}}')
+    with pytest.raises(ValueError, match=r"a\.json: not a results file"):
+        Results.load_json(tmp_path / "a.json")
     (tmp_path / "a.json").write_text("[]")
     with pytest.raises(ValueError, match=r"a\.json: not a results file"):
         Results.load_json(tmp_path / "a.json")
