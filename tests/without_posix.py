@@ -1,8 +1,8 @@
 """`python -m tests.without_posix ARGUMENTS`: the command where what only POSIX has is not there, as on Windows."""
 
 import builtins
+import io
 import os
-import pathlib
 import signal
 import sys
 from pathlib import Path
@@ -39,8 +39,8 @@ def take_away() -> None:
             raise FileNotFoundError(2, "No such file or directory", str(path))
         return open_file(path, *rest, **more)
 
-    os.symlink, os.open, builtins.open = no_link, no_folder, no_proc  # type: ignore[assignment]
-    pathlib.io.open = no_proc  # type: ignore[attr-defined]
+    os.symlink, os.open = no_link, no_folder  # type: ignore[assignment]
+    builtins.open = io.open = no_proc
 
 
 if __name__ == "__main__":

@@ -78,13 +78,17 @@ def named_errors(kind: type[Reader], what: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        if isinstance(error, DataError) and kind.title in text:
+        titled = kind.title in str(error)
+        if isinstance(error, DataError) and titled:
             raise
-        raise DataError(text if kind.title in text else f"{kind.title}: {text}") from error
+        raise DataError(f"{'' if titled else f'{kind.title}: '}{_line(error)}") from error
     except (Exception, SystemExit) as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
         raise DataError(f"{kind.title}: {what} ({text}); mend {kind.__module__}.{kind.__qualname__}") from error
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 @dataclass(frozen=True)
