@@ -28,8 +28,8 @@ from magnet.evaluation.scoring import (
     in_slots,
     planned,
     shared_world,
+    slots_of,
 )
-from magnet.generation.conditioning import occupied
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.metrics.interval import Unit
@@ -125,7 +125,7 @@ class Evaluator(L.LightningModule):
     def on_predict_start(self) -> None:
         datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.context, self.horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
-        self.stats, self.scenes = SamplingStats(), 0
+        self.stats, self.scenes, self.slots = SamplingStats(), 0, slots_of(datamodule.test_windows())
 
     def predict_step(self, batch: Scene, batch_idx: int) -> Scene:
         """Context and samples of one batch of scenes, for writing."""
@@ -154,6 +154,7 @@ class Evaluator(L.LightningModule):
             interval=self.interval,
             device=self.denoiser.device,
         )
+        self.slots = self.scoring.slots
 
     def step(self, batch: Scene) -> None:
         """Measure every method on one batch of test scenes."""
@@ -192,7 +193,7 @@ class Evaluator(L.LightningModule):
         Where nothing is given, samples may stand anywhere; they are moved to where the recorded scenes are.
         """
         whole = self._sampled(scene, samples, generators)
-        if not self.sees(occupied(scene)).nothing_is_given:
+        if not self.sees(self.slots).nothing_is_given:
             return whole
         with torch.autocast(scene.device.type, enabled=False):
             return aligned(whole, max(self.context - 1, 0))
@@ -204,7 +205,7 @@ class Evaluator(L.LightningModule):
         assert isinstance(self.denoiser, DenoiserCore)
         return generate(
             self.denoiser,
-            in_slots(scene, min(scene.agents, max(occupied(scene), self.denoiser.layout.agents))),
+            in_slots(scene, min(scene.agents, max(self.slots, self.denoiser.layout.agents))),
             self.task,
             self.context,
             self.horizon,
@@ -214,6 +215,7 @@ class Evaluator(L.LightningModule):
             self.progress,
             self.stats,
             self.denoiser.condition(scene),
+            self.slots,
         )
 
     # -- what was done -------------------------------------------------------------------------

@@ -17,9 +17,9 @@ from magnet.baselines.predictor import JointBaseline, Predictor, SceneBaseline
 from magnet.baselines.windows import moved_points
 from magnet.body import Body
 from magnet.datamodules.base import MotionDataModule
+from magnet.datamodules.store.memory import WindowIndex
 from magnet.evaluation.by_scene import in_each_scene, of_all_processes, scene_values
 from magnet.evaluation.results import Results
-from magnet.generation.conditioning import occupied
 from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
 from magnet.metrics.guarded import lost_numbers, warn_of_unreal
 from magnet.metrics.interval import Unit, independent_units
@@ -39,6 +39,11 @@ def in_slots(scene: Scene, slots: int) -> Scene:
     if slots < scene.agents:
         return scene.permute_agents(torch.arange(slots, device=scene.device))
     return scene.pad_agents(slots)
+
+
+def slots_of(windows: WindowIndex) -> int:
+    """Number of slots up to the last one that is occupied in any of the scenes, whatever batches they come in."""
+    return 1 + int(np.flatnonzero((windows.members >= 0).any(axis=0)).max(initial=0))
 
 
 def aligned(scene: Scene, frame: int) -> Scene:
@@ -177,7 +182,7 @@ class Scoring:
         store, draw = datamodule.store("test"), datamodule.test_windows()
         frames = self.context + self.horizon
         self.total = max(len(draw), 1)
-        self.slots = 1 + int(np.flatnonzero((draw.members >= 0).any(axis=0)).max(initial=0))
+        self.slots = slots_of(draw)
         # A composed scene counts with the first of its two recordings.
         unit = independent_units(draw.clips[:, 0], draw.starts[:, 0], frames, interval)
         self.unit_of: dict[str, int] = dict(zip(store.labels(draw, frames), unit.tolist(), strict=True))
@@ -190,9 +195,9 @@ class Scoring:
     def generated(self, scene: Scene) -> Tensor:
         """Which future frames of whom the task generates, and so what is scored. -> (horizon, P) bool
 
-        Scenes are sampled by a plan for the slots that somebody is in, so this is the same plan's.
+        Every batch is sampled by a plan for the slots of the whole test set, so this is the same plan's.
         """
-        future = self.sees(occupied(scene)).generated
+        future = self.sees(self.slots).generated
         return torch.nn.functional.pad(future, (0, scene.agents - future.shape[1])).to(scene.device)
 
     def _training_windows(self, datamodule: MotionDataModule) -> Windows:

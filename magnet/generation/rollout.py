@@ -65,6 +65,7 @@ def generate(
     progress: Callable[[int], None] | None = None,
     stats: SamplingStats | None = None,
     cond: Tensor | None = None,
+    slots: int = 0,
 ) -> Scene:
     """Sample a task.
 
@@ -82,6 +83,7 @@ def generate(
         stats: filled with how consistent the sampled tokens are, and how often the network ran.
         cond: what the model is conditioned on, (B, C), or (B, N, C) for each token step of context and frames; see
             `Denoiser.condition`. None, and steps behind the N: nothing.
+        slots: slots to plan for at least, such as those of a set of which these are some scenes.
 
     Returns:
         Scene of B * samples, context + frames frames, the given frames included.
@@ -91,7 +93,8 @@ def generate(
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
     more = (options, generator, progress, stats)
-    return cat_time(list(stream(model, scene, task, context, frames, samples, *more, CHUNK, cond)))
+    rollout = Rollout(denoiser_of(model), scene, task, context, frames, samples, *more, CHUNK, cond, slots)
+    return cat_time(list(rollout.chunks()))
 
 
 def stream(
@@ -155,6 +158,7 @@ class Rollout:
         stats: SamplingStats | None,
         chunk: int | None,
         cond: Tensor | None = None,
+        slots: int = 0,
     ) -> None:
         check_request(model, scene, context, frames, samples, task)
         count_unseen_writes(model)
@@ -168,7 +172,7 @@ class Rollout:
         o = self.options
         tokens = model.window if self.frames is None else -(-self.frames // TOKEN_FRAMES)
         past = context // TOKEN_FRAMES
-        grid = planning_grid(max(tokens, past), occupied(scene), past, model.window, o)
+        grid = planning_grid(max(tokens, past), max(occupied(scene), slots), past, model.window, o)
         self.length: float = grid.tokens
         if frames is None:
             schedule, self.plan = periodic_plan(task, grid, layout.agents, self.online)

@@ -13,12 +13,13 @@ from torch import Tensor
 from magnet.evaluation.evaluator import MODEL, TRAINING, TRUTH, Evaluator, shared_world
 from magnet.motion.scene import Scene
 from magnet.sampling.schedule import Grid, MaskSchedule
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.tasks.inbetweening import Inbetweening
-from magnet.tasks.joint import JointFuture
+from magnet.tasks.joint import Generation, JointFuture
 from magnet.testing import tiny_denoiser
 from tests.cases import some_slow
 from tests.datamodules.fakes import random_clip
-from tests.evaluation.test_evaluator import FAST, data, run
+from tests.evaluation.test_evaluator import FAST, data, predicted, run
 
 CONTEXT, HORIZON, TOKENS = 16, 20, 9
 
@@ -126,6 +127,34 @@ def test_the_plan_is_that_of_the_slots_somebody_is_in() -> None:
     assert scored.any(dim=0).tolist() == [False, True, False]
     changed = (whole.T_world_root != batch.repeat(2).T_world_root).flatten(3).any(dim=-1).any(dim=0)
     assert torch.equal(changed[CONTEXT:], scored)
+
+
+MIXED = {
+    "keyframes of the second": Inbetweening(agents=(1,)),
+    "the first is given": HalfGiven(),
+    "together": JointFuture(),
+    "in turn": AgenticAsync(),
+    "at once": AgenticSync(),
+    "nothing is given": Generation(),
+}
+
+
+@pytest.mark.parametrize("task", some_slow(MIXED.values(), *list(MIXED.values())[2:]), ids=MIXED.keys())
+def test_the_plan_does_not_depend_on_the_batch_size(task: object) -> None:
+    """Of scenes of one person and of two every batch is planned for two, also one in which nobody is in slot 1."""
+    context = 0 if isinstance(task, Generation) else CONTEXT
+    people = (1, 2) if not isinstance(task, HalfGiven) else (2, 3)
+    clips = [random_clip(f"{split}{k}", 120, k, split=split) for split in ("train", "test") for k in people]
+    sets = [data(clips, batch_size=size, context_frames=context) for size in (1, 9)]
+    options = {"task": task, "samples": 1}
+    alone, together = (predicted(each, **options)[0] for each in sets)
+    assert set(alone.present.sum(dim=1).tolist()) == set(people)
+    torch.testing.assert_close(alone.body_rot, together.body_rot, rtol=0, atol=1e-4)
+    torch.testing.assert_close(alone.T_world_root, together.T_world_root, rtol=0, atol=1e-4)
+    assert alone.given is not None and torch.equal(alone.given, together.given)
+    one, all_ = (run(each, baselines=False, **options).results.rows for each in sets)
+    for row in one:
+        assert one[row] == pytest.approx(all_[row], rel=1e-3, abs=1e-4, nan_ok=True), row
 
 
 def rows(model_slots: int, data_slots: int, baselines: bool) -> dict[str, dict[str, float]]:
