@@ -14,12 +14,14 @@ from torch import Tensor
 
 from magnet.body import Body, load_body
 from magnet.datamodules.clip import RESHAPED, Clip, Split, at_least
+from magnet.datamodules.doubted import doubt_of
 from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
 from magnet.datamodules.store.memory import MemoryStore, WindowIndex
 from magnet.datamodules.store.reader import StoreSplit
 from magnet.datamodules.store.windows import RandomWindows, composed_windows, fixed_windows, longest_stretch
 from magnet.errors import DataError
+from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene
 from magnet.plugins import attempted, told
 from magnet.seeding import derive
@@ -36,6 +38,10 @@ def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
 
     Raises:
         DataError: it is not there, takes no split, raises what is no ValueError, or gives something else than clips.
+        ValueError: a clip has another frame rate than the models.
+
+    Warns:
+        once for each data set, if its clips look like another unit, up axis or floor.
     """
     name = f"data set {type(data).__module__}.{type(data).__qualname__}"
     given: list[Any] = []
@@ -54,6 +60,11 @@ def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
             f"{name}: clips({split!r}) gave {other[0].name}, which is of split {other[0].split!r}; "
             "give only those of the split that is asked for"
         )
+    for clip in clips:
+        require_rate(clip.scene, f"{name}: clip {clip.name}")
+    if not data.doubted and (doubt := doubt_of(clips)):
+        data.doubted = True
+        rank_zero_warn(f"{name}: {doubt}")
     return list(clips)
 
 
@@ -86,6 +97,7 @@ class MotionDataModule(LightningDataModule):
         ValueError: a number is out of its range.
     """
 
+    doubted: bool = False  # it has been said that clips look wrong; True from the start: they are not looked at
     maps_files: ClassVar[bool] = False  # `open_store` leaves frames on disk and sends them compact to the device
 
     def __init__(

@@ -22,6 +22,8 @@ class Parts(MotionDataModule):
         ValueError: no data sets, or bodies differ.
     """
 
+    doubted = True  # each of the others is looked at by itself
+
     def __init__(self, data: list[MotionDataModule], **kwargs: Any) -> None:
         super().__init__(**kwargs)
         if not data:

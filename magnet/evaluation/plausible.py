@@ -10,7 +10,7 @@ from torch import Tensor
 
 from magnet.body.joints import ANKLES, HIPS, KNEES, NECK, PELVIS
 from magnet.evaluation.scoring import Sight
-from magnet.generation.misread import ALONG, FAST
+from magnet.export.misread import ALONG, FAST
 
 UNITS = {"mm": 0.001, "cm": 0.01, "inch": 0.0254, "foot": 0.3048}
 """Metres of each."""

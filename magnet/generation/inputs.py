@@ -11,8 +11,8 @@ from magnet.body.base import MOST_SHAPE
 from magnet.body.floor import MOMENTS, lowest, off_floor
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
+from magnet.export.misread import misread, steps_of
 from magnet.generation.conditioning import label
-from magnet.generation.misread import misread, steps_of
 from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
