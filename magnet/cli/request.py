@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
         named = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
         task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
+        task = replace(task, asked=bool(fields or given.of("task")))
     layers = [each.text() for each in settled.layers if each.options]
     return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task)
 
@@ -177,3 +178,18 @@ def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[
     if command not in SAMPLING or name is None or not config_files.is_preset(name):
         return {}, flags
     return {"sampler": config_files.sampler_preset(name)}, Arguments(flags).without("sampler")
+
+
+def refuse_task(request: Request, model: object) -> None:
+    """Refuse a task, or an option of one, for a model that samples none: such a model is tested by losses of its own.
+
+    A task of a file is passed over, for the configuration of any run of `test` has one.
+
+    Raises:
+        CommandError: the command line names one.
+    """
+    if request.task is not None and request.task.asked:
+        raise CommandError(
+            f"--task {request.task.name}: {request.checkpoint or 'model'} holds a {type(model).__name__.lower()}, and "
+            f"tasks need a denoiser: name one with --ckpt_path, or leave --task out"
+        )

@@ -30,10 +30,12 @@ class TaskChoice:
     Attributes:
         name: as `magnet tasks` lists it.
         fields: its options, all of them, in plain values.
+        asked: the command line names it or one of its options; not so of the default, nor of a file's.
     """
 
     name: str
     fields: dict[str, Any]
+    asked: bool = False
 
     @property
     def task(self) -> Task:

@@ -25,7 +25,7 @@ from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_fold
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
-from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request
+from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
 from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
 from magnet.denoiser.token_model import TokenModel
@@ -328,7 +328,7 @@ class MagnetCLI(LightningCLI):
     def _evaluate(self) -> None:
         """Put an evaluator around a model, whose checkpoint is read here: the Trainer's model is the evaluator."""
         if self.request.task is None or not isinstance(self.model, TokenModel):
-            return
+            return refuse_task(self.request, self.model)
         if self.checkpoint is not None:
             stored = checkpoints.read(self.checkpoint)
             self.model.on_load_checkpoint(stored)

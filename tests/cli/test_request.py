@@ -1,4 +1,4 @@
-"""Which checkpoint a command starts from."""
+"""Which checkpoint a command starts from, and whether it can do the task."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
+from magnet import cli
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.errors import CommandError
 from magnet.cli.request import which_checkpoint
+from magnet.testing import tiny_tokenizer
+from magnet.testing.models import TINY_TOKENIZER
 
 
 def finished(runs: Path, name: str) -> Path:
@@ -33,3 +37,25 @@ def test_a_fit_goes_on_with_its_own_last_run_and_a_test_takes_anybodys(tmp_path:
     assert which_checkpoint("fit", there, tmp_path, "mine") == newer
     with pytest.raises(CommandError, match=r"no run with a checkpoints/last\.ckpt in .*third"):
         which_checkpoint("fit", last, tmp_path, "third")
+
+
+@pytest.mark.parametrize("words", ["test --task joint_future", "predict --task=joint_future"])
+def test_a_task_of_a_tokenizer_is_refused_in_a_line(words: str, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kept = {"class_path": "magnet.tokenizer.module.Tokenizer", "init_args": TINY_TOKENIZER}
+    torch.save({"state_dict": tiny_tokenizer().state_dict(), "magnet_config": {"model": kept}}, toy / "codes.ckpt")
+    assert cli.main([*words.split(), "--ckpt_path", "codes.ckpt", "--out", "out", "--trainer.accelerator", "cpu"]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == (
+        "magnet: error: --task joint_future: codes.ckpt holds a tokenizer, and tasks need a denoiser: name one with "
+        "--ckpt_path, or leave --task out"
+    )
+    assert not (toy / "out").exists()
+
+
+def test_a_task_of_a_file_does_not_hinder_the_test_of_a_model_without_tasks(toy: Path) -> None:
+    """The configuration of every run of `magnet test` has one."""
+    cpu = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+    fit = ("--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "1")
+    assert cli.main(["fit", *fit, "--out", "trained", *cpu]) == 0
+    (toy / "again.yaml").write_text("task: {name: joint_future}\n")
+    assert cli.main(["test", "--config", "again.yaml", "--ckpt_path", "trained", "--out", "out", *cpu]) == 0
