@@ -40,12 +40,18 @@ def reader_options(kind: type[Reader], words: Sequence[str]) -> dict[str, Any]:
     from jsonargparse import ArgumentError
 
     from magnet.cli.errors import wrong_value
+    from magnet.cli.flags import closest
 
     options = reader_parser(kind)
+    known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
+    for word in words:
+        name = word.partition("=")[0]
+        if word.startswith("--reader.") and not any(name == each or name.startswith(f"{each}.") for each in known):
+            hint = closest(name, known) or f"; its options are {', '.join(known) or 'none'}"
+            raise ValueError(f"{kind.title}: no option {name}{hint}")
     try:
         config = options.parse_args(list(words)).as_dict().get("reader", {})
     except ArgumentError as error:
-        known = [f for a in options._actions for f in a.option_strings if f.startswith("--reader.")]
         said = wrong_value(str(error)) or str(error)
         raise ValueError(f"{kind.title}: {said}; its options are {', '.join(known) or 'none'}") from error
     flags = {word.split("=")[0].removeprefix("--reader.") for word in words if word.startswith("--reader.")}

@@ -18,6 +18,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgre
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from magnet.checkpoints import FOLDER
 from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.errors import CommandError
 from magnet.cli.pipes import output_closed
@@ -77,6 +78,19 @@ def run_folder(root: Path, out: str | None) -> Path:
             "first comes first: magnet predict FILE ... --out FILE"
         )
     return folder
+
+
+def with_checkpoint(settings: Any, command: str, checkpoint: Path | None) -> Any:
+    """A run's settings as config.yaml holds them: with what was sampled or measured, so that it can be run again.
+
+    settings: jsonargparse's, which stay as they are. A training's go on from nothing, as it did at first.
+    """
+    if command == "fit" or checkpoint is None:
+        return settings
+    changed = settings.clone()
+    shipped = checkpoint.parent == FOLDER
+    changed["ckpt_path"] = checkpoint.name if shipped else str(checkpoint.resolve())
+    return changed
 
 
 def checkpoints(folder: Path, model: LightningModule, callbacks: Sequence[Callback] = ()) -> list[Callback]:

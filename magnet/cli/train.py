@@ -306,7 +306,8 @@ class MagnetCLI(LightningCLI):
     def _record(self) -> run_folder.Record:
         self._dump_config()
         options = {key: self.config_dump.get(key) for key in ("model", "data")}
-        config = self._parser(self.command).dump(self.config[self.command], skip_none=False)
+        settings = run_folder.with_checkpoint(self.config[self.command], self.command, self.checkpoint)
+        config = self._parser(self.command).dump(settings, skip_none=False)
         facts = run_folder.seeds(self.config_dump)
         facts["checkpoint"] = None if self.checkpoint is None else str(self.checkpoint)
         latest = self.command == "fit" and self._option("out") is None
@@ -320,7 +321,7 @@ class MagnetCLI(LightningCLI):
         more = {"verbose": False} if subcommand in ("validate", "test") else {}
         words = super()._prepare_subcommand_kwargs(subcommand)
         if self.evaluator is not None:
-            return {**words, **more, "model": self.evaluator}
+            return {**words, **more, "ckpt_path": None, "model": self.evaluator}  # its weights are read already
         return {**words, **more, "ckpt_path": checkpoint, "weights_only": True}
 
     # -- running -------------------------------------------------------------------------------

@@ -159,7 +159,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
         ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
-        ("prepare dd100 --root dl --out o --body dl/body.npz --reader.wrong 1", "its options are"),
+        ("prepare dd100 --root dl --out o --body dl/body.npz --reader.wrong 1", "no option --reader.wrong; there are"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --workers 0", "workers: got 0"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --up=up", "up: got 'up'"),
         ("info dl", "is not a prepared store"),
@@ -241,6 +241,8 @@ def test_readers_options_are_read_by_their_types():
     kind = registry.reader("embody3d")
     got = data_options.reader_options(kind, ["--reader.people", "[2,3]", "--reader.good=0"])
     assert got == {"people": [2, 3], "good": 0}
+    with pytest.raises(ValueError, match=r"no option --reader\.peop; did you mean --reader\.people"):
+        data_options.reader_options(kind, ["--reader.peop", "[2,3]"])
 
 
 def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):

@@ -197,6 +197,8 @@ def test_a_run_records_the_seeds_that_it_used(sampling: Path, toy: Path) -> None
     facts = json.loads((toy / "tested" / "run.json").read_text())
     assert facts["seed"] == ToyModel.seen["evaluator"].seed == 5
     assert facts["seeds"] == {"seed": 5, "seed_everything": 6}  # neither the toy nor its data have one of their own
+    go("test", "--config", "tested/config.yaml", "--out", "again")
+    assert json.loads((toy / "again" / "run.json").read_text())["checkpoint"].endswith("trained/checkpoints/last.ckpt")
 
 
 @pytest.mark.parametrize(
