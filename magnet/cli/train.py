@@ -21,7 +21,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, optimizers, outputs, run_folder, run_logs
+from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_folder, run_folder, run_logs
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
@@ -161,18 +161,19 @@ class MagnetCLI(LightningCLI):
         self.evaluator: Evaluator | None = None
         self.predicted: list[Any] = []
         self.models, self.data = named_classes()
-        super().__init__(
-            LightningModule,
-            LightningDataModule,
-            save_config_callback=None,
-            seed_everything_default=SEED,
-            parser_kwargs={"prog": "magnet", self.command: {"description": None}},
-            parser_class=Parser,
-            subclass_mode_model=True,
-            subclass_mode_data=True,
-            args=[self.command, *request.flags],
-            auto_configure_optimizers=False,
-        )
+        with contextlib.ExitStack() as self.held:  # a training's folder, until it ends
+            super().__init__(
+                LightningModule,
+                LightningDataModule,
+                save_config_callback=None,
+                seed_everything_default=SEED,
+                parser_kwargs={"prog": "magnet", self.command: {"description": None}},
+                parser_class=Parser,
+                subclass_mode_model=True,
+                subclass_mode_data=True,
+                args=[self.command, *request.flags],
+                auto_configure_optimizers=False,
+            )
 
     # -- parsing -------------------------------------------------------------------------------
 
@@ -257,8 +258,11 @@ class MagnetCLI(LightningCLI):
         config = self.config_init[self.command]["trainer"]
         callbacks = list(config.get("callbacks") or [])
         fit = self.command == "fit"
+        if fit and not config.get("fast_dev_run"):
+            self.held.enter_context(own_folder.held(self.folder))
         if fit and config.get("enable_checkpointing") is not False and not config.get("fast_dev_run"):
-            self._refuse_overwriting()
+            if not self._goes_on:
+                own_folder.refuse_overwriting(self.folder)
             callbacks += run_folder.checkpoints(self.folder, self.model, callbacks)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
@@ -290,12 +294,6 @@ class MagnetCLI(LightningCLI):
         if taken != asked and "LOCAL_RANK" not in os.environ:
             print(f"{asked}: this processor only emulates bfloat16, many times slower: it is float32 instead")
         return taken
-
-    def _refuse_overwriting(self) -> None:
-        if (self.folder / "checkpoints").exists() and not self._goes_on and not run_folder.started_by_lightning():
-            raise CommandError(
-                f"{self.folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
-            )
 
     @property
     def _goes_on(self) -> bool:

@@ -1,0 +1,62 @@
+"""A training has its folder to itself: another one there, running or finished, is not overwritten."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from magnet.cli.errors import CommandError
+from magnet.cli.run_folder import first_process, started_by_lightning
+from magnet.files import Taken, alone
+
+LOCK = ".training.lock"
+
+
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock meanwhile; other processes of the same training leave it to the first one.
+
+    The lock goes with the process, however it ends. Where no lock can be had, the training runs without: a folder that
+    cannot be written is told of later, and some network file systems have no locks.
+
+    Raises:
+        CommandError: another training works there.
+    """
+    if not first_process():
+        yield
+        return
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    with contextlib.ExitStack() as lock:
+        # Called last of all: the lock's file goes once it is let go, and folders that nothing came into.
+        lock.callback(_leave, folder, made)
+        with contextlib.suppress(OSError, NotImplementedError):
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                lock.enter_context(alone(folder / LOCK, ""))
+            except Taken as error:
+                lock.pop_all()
+                raise CommandError(
+                    f"another training is working in {folder}; wait for it, or choose another --out"
+                ) from error
+        yield
+
+
+def _leave(folder: Path, made: list[Path]) -> None:
+    with contextlib.suppress(OSError):  # another training may hold it by now
+        (folder / LOCK).unlink()
+    for each in made:
+        with contextlib.suppress(OSError):
+            each.rmdir()
+
+
+def refuse_overwriting(folder: Path) -> None:
+    """Refuse a new training where one has been.
+
+    Raises:
+        CommandError: there are checkpoints of one.
+    """
+    if (folder / "checkpoints").exists() and not started_by_lightning():
+        raise CommandError(
+            f"{folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
+        )

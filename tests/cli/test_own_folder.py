@@ -1,0 +1,69 @@
+"""Two trainings in one folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnet import cli
+from magnet.cli import own_folder
+from magnet.files import alone
+from tests.toys import ToyModel
+
+FIT = ["fit", "--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "1", "--out", "two"]
+FIT += ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
+HOLDS = """
+import sys
+from filelock import FileLock
+lock = FileLock(sys.argv[1])
+lock.acquire()
+print("held", flush=True)
+input()
+"""
+
+
+def test_a_second_training_in_a_folder_is_refused_while_the_first_one_works(
+    toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock = toy / "two" / own_folder.LOCK
+    lock.parent.mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline()
+        assert cli.main(FIT) == 2
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert told == "magnet: error: another training is working in two; wait for it, or choose another --out"
+        assert [path.name for path in (toy / "two").iterdir()] == [own_folder.LOCK]
+        other.communicate(b"\n")
+    assert cli.main(FIT) == 0
+    assert not lock.exists()
+    assert cli.main([*FIT[:6], "2", "--ckpt_path", "last", *FIT[7:]]) == 0, "the lock went with the first training"
+
+
+def test_the_lock_is_held_while_training_and_by_the_first_process_alone(
+    toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    monkeypatch.setattr(
+        ToyModel, "on_train_start", lambda self: seen.append((toy / "two" / own_folder.LOCK).exists()), raising=False
+    )
+    assert cli.main(FIT) == 0 and seen == [True]
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    with alone(toy / own_folder.LOCK, "taken"), own_folder.held(toy):
+        pass
+    monkeypatch.delenv("LOCAL_RANK")
+    with own_folder.held(toy / "never" / "began"):
+        assert (toy / "never" / "began").is_dir()
+    assert not (toy / "never").exists()
+
+
+def test_a_training_runs_without_a_lock_where_there_are_none(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*_: object) -> None:
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(own_folder, "alone", none)
+    assert cli.main(FIT) == 0
