@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,7 +57,18 @@ def refuse_overwriting(folder: Path) -> None:
     Raises:
         CommandError: there are checkpoints of one.
     """
-    if (folder / "checkpoints").exists() and not started_by_lightning():
-        raise CommandError(
-            f"{folder} holds a training run already: choose another --out, or go on with --ckpt_path last"
-        )
+    place = folder / "checkpoints"
+    if not place.exists() or started_by_lightning():
+        return
+    if (place / "last.ckpt").exists():
+        advice = "choose another --out, or go on with --ckpt_path last"
+    elif there := kept(place):
+        advice = f"choose another --out, or go on with --ckpt_path {shlex.quote(str(there))}"
+    else:
+        advice = "none of its checkpoints is left, so choose another --out"
+    raise CommandError(f"{folder} holds a training run already: {advice}")
+
+
+def kept(place: Path) -> Path | None:
+    """The newest checkpoint in a folder of them."""
+    return max(place.glob("*.ckpt"), key=lambda file: file.stat().st_mtime, default=None)

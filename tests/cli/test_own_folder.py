@@ -67,3 +67,22 @@ def test_a_training_runs_without_a_lock_where_there_are_none(toy: Path, monkeypa
 
     monkeypatch.setattr(own_folder, "alone", none)
     assert cli.main(FIT) == 0
+
+
+@pytest.mark.parametrize(
+    ("there", "advice"),
+    [
+        (["last.ckpt", "best.ckpt"], "choose another --out, or go on with --ckpt_path last"),
+        (["best.ckpt"], "choose another --out, or go on with --ckpt_path two/checkpoints/best.ckpt"),
+        ([], "none of its checkpoints is left, so choose another --out"),
+    ],
+)
+def test_a_training_that_was_there_before_goes_on_with_a_checkpoint_that_is_there(
+    there: list[str], advice: str, toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = toy / "two" / "checkpoints"
+    place.mkdir(parents=True)
+    for name in there:
+        (place / name).touch()
+    assert cli.main(FIT) == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"two holds a training run already: {advice}")
