@@ -19,6 +19,7 @@ from magnet import checkpoints
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
+from magnet.cli.kept_checkpoints import no_run
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.old_names import renamed_flags, told
 
@@ -141,18 +142,17 @@ def import_named(given: Arguments) -> None:
                 raise CommandError(f"{where} {error}") from error
 
 
-def find_checkpoint(name: str | None, folders: Iterable[Path]) -> Path:
+def find_checkpoint(name: str | None, folders: Iterable[Path], runs: Path | None = None) -> Path:
     """What `--ckpt_path` means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
 
     Raises:
-        CommandError: there is none.
+        CommandError: there is none; says which there are in `runs`.
     """
     if name in ("last", "best"):
         folders = list(folders)
         found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]
         if not found:
-            looked = " or ".join(map(str, folders))
-            raise CommandError(f"--ckpt_path {name}: no run with a checkpoints/{name}.ckpt in {looked}; name a file")
+            raise CommandError(no_run(name, folders, runs))
         return max(found, key=lambda file: file.stat().st_mtime)
     try:
         return checkpoints.resolve(name)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from magnet.cli.errors import CommandError
+from magnet.cli.kept_checkpoints import newest
 from magnet.cli.run_folder import first_process, started_by_lightning
 from magnet.files import Taken, alone
 
@@ -62,13 +63,8 @@ def refuse_overwriting(folder: Path) -> None:
         return
     if (place / "last.ckpt").exists():
         advice = "choose another --out, or go on with --ckpt_path last"
-    elif there := kept(place):
+    elif there := newest(place):
         advice = f"choose another --out, or go on with --ckpt_path {shlex.quote(str(there))}"
     else:
         advice = "none of its checkpoints is left, so choose another --out"
     raise CommandError(f"{folder} holds a training run already: {advice}")
-
-
-def kept(place: Path) -> Path | None:
-    """The newest checkpoint in a folder of them."""
-    return max(place.glob("*.ckpt"), key=lambda file: file.stat().st_mtime, default=None)

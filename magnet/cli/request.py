@@ -148,9 +148,9 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         return None
     if command == "fit":  # a run goes on from where it ended, not from where it was best
         found = checkpoints.of_run(Path(name), ("last", "best"))
-        return checkpoint_config.find_checkpoint(str(found), [Path(out) if out else runs / run])
+        return checkpoint_config.find_checkpoint(str(found), [Path(out) if out else runs / run], runs)
     folders = [Path(out or runs), runs / run, runs]
-    return checkpoint_config.find_checkpoint(name, folders)
+    return checkpoint_config.find_checkpoint(name, folders, runs)
 
 
 def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:

@@ -39,6 +39,26 @@ def test_a_fit_goes_on_with_its_own_last_run_and_a_test_takes_anybodys(tmp_path:
         which_checkpoint("fit", last, tmp_path, "third")
 
 
+def test_where_no_run_has_the_checkpoint_those_that_are_there_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs, last = Path("runs"), Arguments.split(["--ckpt_path", "last"])
+
+    def told(command: str, given: Arguments) -> str:
+        with pytest.raises(CommandError) as error:
+            which_checkpoint(command, given, runs, command)
+        return str(error.value)
+
+    none = "--ckpt_path last: no run with a checkpoints/last.ckpt in"
+    assert told("test", last) == f"{none} runs or runs/test; name a file"
+    old, new = older(finished(runs, "finetune/a")), finished(runs, "finetune/b")
+    assert told("fit", last) == f"{none} runs/fit; name a file; the newest are {new}, {old}"
+    (best := finished(Path(), "mine").with_name("best.ckpt")).with_name("last.ckpt").rename(best)
+    mine = Arguments.split(["--ckpt_path", "last", "--out", "mine"])
+    assert told("fit", mine) == f"{none} mine; name a file; the newest is mine/checkpoints/best.ckpt"
+
+
 @pytest.mark.parametrize("words", ["test --task joint_future", "predict --task=joint_future"])
 def test_a_task_of_a_tokenizer_is_refused_in_a_line(words: str, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = {"class_path": "magnet.tokenizer.module.Tokenizer", "init_args": TINY_TOKENIZER}
