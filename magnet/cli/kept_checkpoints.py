@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -43,3 +44,10 @@ def newest_of_runs(folders: Iterable[Path]) -> list[Path]:
     places = {place for folder in folders for place in folder.glob("**/checkpoints")}
     files = [file for place in places if (file := newest(place)) is not None]
     return sorted(files, key=written, reverse=True)[:NAMED]
+
+
+def told(name: str | None, found: Path) -> Path:
+    """The checkpoint that was found, of which a line says which it is where `last` or `best` was asked for."""
+    if name in ("last", "best"):
+        print(f"magnet: --ckpt_path {name} is {found}", file=sys.stderr)
+    return found

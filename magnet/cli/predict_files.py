@@ -135,6 +135,7 @@ def main(arguments: Sequence[str]) -> int:
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     from magnet.api import Model, Motion
     from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
@@ -148,7 +149,8 @@ def main(arguments: Sequence[str]) -> int:
         scene_files.require_unread(out, options.inputs, people)
     if options.task not in (None, "generation"):  # of a crowd these are said later: it may change the task
         task_of(options, groups["task"], ())
-    model = Model(DenoiserCore.load(find_checkpoint(options.ckpt_path, [Path("runs")])), sampler)
+    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
+    model = Model(DenoiserCore.load(found), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
     files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)

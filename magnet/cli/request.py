@@ -15,6 +15,7 @@ from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import valued
+from magnet.cli.kept_checkpoints import told
 from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
 from magnet.datamodules import registry
 
@@ -150,7 +151,8 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         found = checkpoints.of_run(Path(name), ("last", "best"))
         return checkpoint_config.find_checkpoint(str(found), [Path(out) if out else runs / run], runs)
     folders = [Path(out or runs), runs / run, runs]
-    return checkpoint_config.find_checkpoint(name, folders, runs)
+    found = checkpoint_config.find_checkpoint(name, folders, runs)
+    return told(name, found) if run_folder.first_process() else found
 
 
 def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:

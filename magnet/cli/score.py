@@ -83,6 +83,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
         CommandError: another number of samples, or no such checkpoint.
     """
     from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
     from magnet.evaluation import methods
     from magnet.evaluation.submission import Submission, answered
@@ -96,7 +97,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     if name in methods.BASELINES:
         method = methods.baseline(name, task, data)
     else:
-        denoiser = DenoiserCore.load(find_checkpoint(given.method, [Path("runs")]))
+        denoiser = DenoiserCore.load(told(given.method, find_checkpoint(given.method, [Path("runs")])))
         method = methods.model(denoiser, task, data, samples, SamplerOptions.preset(given.sampler))
     names, joints = answered(data, method, samples, given.seed)
     made = Submission(benchmark.label, given.task, Path(given.method).stem, tuple(names), joints)

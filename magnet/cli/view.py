@@ -211,7 +211,8 @@ def _watch(options: argparse.Namespace) -> Any:
 def _record(options: argparse.Namespace, scene: Any) -> None:
     import torch
 
-    from magnet.cli import checkpoint_config
+    from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.trace import record
     from magnet.motion.tokens import TOKEN_FRAMES
@@ -225,7 +226,8 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
         schedule_of(task, Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
     except ValueError as error:
         raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
-    model = DenoiserCore.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
+    model = DenoiserCore.load(found)
     generator = torch.Generator().manual_seed(options.seed)
     sampler = sampler_options(options)
     recording = record(model, scene, task, options.context, options.frames, sampler, generator)
@@ -252,7 +254,8 @@ def _live(options: argparse.Namespace) -> Any:
 
     from magnet import checkpoints
     from magnet.body.base import load_body
-    from magnet.cli import checkpoint_config
+    from magnet.cli.checkpoint_config import find_checkpoint
+    from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.live import Live
     from magnet.motion.scene import Scene
@@ -270,7 +273,8 @@ def _live(options: argparse.Namespace) -> Any:
         start = takes[0].scene
     elif options.people is None:
         start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
-    model = DenoiserCore.load(checkpoint_config.find_checkpoint(options.ckpt_path, [Path("runs")]))
+    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
+    model = DenoiserCore.load(found)
     live = Live(
         model,
         2 if options.people is None else options.people,

@@ -251,7 +251,7 @@ def test_print_config_is_a_configuration(toy: Path, capsys: pytest.CaptureFixtur
     assert yaml.safe_load(first)["model"]["init_args"]["lr"] == 0.3
 
 
-def test_latest_leads_to_the_newest_run(toy: Path) -> None:
+def test_latest_leads_to_the_newest_run(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (toy / "salsa.yaml").write_text("model: {class_path: ToyModel}\ntrainer: {max_epochs: 1}\n")
     for _ in range(2):
         go("fit", "--config", "salsa.yaml")
@@ -261,6 +261,8 @@ def test_latest_leads_to_the_newest_run(toy: Path) -> None:
     assert (toy / "runs" / "salsa" / "latest").resolve() == newest.resolve()
     go("test", "--ckpt_path", "last", "--out", "elsewhere")
     go("test", "--ckpt_path", "last")
+    taken = newest.relative_to(toy) / "checkpoints" / "last.ckpt"
+    assert capsys.readouterr().err.count(f"magnet: --ckpt_path last is {taken}\n") == 2
 
 
 def test_sampling_options_reach_the_evaluator(sampling: Path) -> None:
