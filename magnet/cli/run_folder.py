@@ -130,16 +130,30 @@ class BestCheckpoint(ModelCheckpoint):
 
 
 class LastCheckpoint(ModelCheckpoint):
-    """Also saves when training ends between two validations, which Lightning's does not."""
+    """Also saves when training ends between two validations, which Lightning's does not.
+
+    Args:
+        place: where, as messages name it: Lightning's `dirpath` is absolute.
+        options: Lightning's.
+    """
+
+    def __init__(self, place: Path, *options: Any, **more: Any) -> None:
+        super().__init__(place, *options, **more)
+        self.place = place
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Save, but not where a run was refused before its first step."""
-        if not isinstance(exception, CommandError):
-            super().on_exception(trainer, pl_module, exception)
+        """Save, but not where a run was refused before its first step; say how an interrupted training goes on."""
+        if isinstance(exception, CommandError):
+            return
+        super().on_exception(trainer, pl_module, exception)
+        last = self.place / "last.ckpt"
+        stopped = isinstance(exception, KeyboardInterrupt | SIGTERMException)
+        if stopped and trainer.is_global_zero and last.exists():
+            print(f"interrupted; the same command with --ckpt_path {shlex.quote(str(last))} goes on", file=sys.stderr)
 
 
 def progress_bar(sampling: bool = False) -> ProgressBar:
@@ -328,13 +342,6 @@ class Record(Callback):
         )
 
     on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Say how an interrupted training goes on."""
-        last = self.folder / "checkpoints" / "last.ckpt"
-        stopped = isinstance(exception, KeyboardInterrupt | SIGTERMException)
-        if stopped and trainer.is_global_zero and last.exists():
-            print(f"interrupted; the same command with --ckpt_path {shlex.quote(str(last))} goes on", file=sys.stderr)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[CONFIG_KEY] = self.options

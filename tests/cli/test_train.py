@@ -353,7 +353,7 @@ def test_a_training_that_is_told_to_end_says_how_it_goes_on_and_is_no_success(
     toy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def told(self: ToyModel, *_: Any) -> None:
-        if self.trainer.global_step == 2:
+        if self.trainer.global_step == 1:  # before any checkpoint
             os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(ToyModel, "on_train_batch_start", told, raising=False)
@@ -362,7 +362,8 @@ def test_a_training_that_is_told_to_end_says_how_it_goes_on_and_is_no_success(
         assert cli.main([*FIT, *CPU]) == 143
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert "goes on" in capsys.readouterr().err
+    hint = "interrupted; the same command with --ckpt_path trained/checkpoints/last.ckpt goes on"
+    assert hint in capsys.readouterr().err.splitlines()
     assert (toy / "trained/checkpoints/last.ckpt").exists()
 
 
