@@ -70,12 +70,15 @@ def read(folder: Path) -> tuple[Results, SceneValues]:
     from magnet.evaluation.by_scene import SceneValues
     from magnet.evaluation.results import Results
 
+    wanted = "expected a folder that magnet test or magnet score has written"
+    if not folder.exists():
+        raise CommandError(f"{folder}: is not there, {wanted}")
     folder = folder.parent if folder.suffix == ".json" else folder
     for name in ("results.json", FILE):
         if not (folder / name).is_file():
             raise CommandError(
-                f"{folder}: has no {name}, expected a folder that magnet test or magnet score has written; results of "
-                "earlier versions have no values of single scenes, so run the test again"
+                f"{folder}: has no {name}, {wanted}; results of earlier versions have no values of single scenes, so "
+                "run the test again"
             )
     return Results.load_json(folder / "results.json"), SceneValues.load(folder / FILE)
 

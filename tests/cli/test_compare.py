@@ -64,7 +64,8 @@ def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     ("words", "message"),
     [
         (["a"], "got 1 folder, expected two, or one with --rows ROW ROW"),
-        (["a", "nowhere"], "nowhere: has no results.json, expected a folder that magnet test or"),
+        (["a", "nowhere"], "nowhere: is not there, expected a folder that magnet test or magnet score"),
+        (["a", "."], ".: has no results.json, expected a folder that magnet test or"),
         (["a", "old"], "old: has no scenes.json"),
         (["a", "--rows", "magnet", "nn"], "no row nn; there are magnet, NN. See a"),
         (["a", "far"], "no common test scenes: one has take [0:1], the other take [50:51]"),
