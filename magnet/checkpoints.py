@@ -290,6 +290,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
         for number, part in enumerate(_in_parts(checkpoint["state_dict"], half), 1):
             file = aside / f"weights-{number:02d}.safetensors"
             save_file(part, file)
+            file.chmod(0o644)  # safetensors writes for the owner alone
             sync(file)
             listed.append({"file": file.name, "sha256": file_hash(file)})
         config = {
