@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import ast
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser
@@ -20,6 +22,8 @@ FILE = "scenes.json"
 """What `magnet test` and `magnet score` write beside results.json."""
 SAME = ("task", "benchmark", "context frames", "horizon frames")
 """Facts that are told where they differ."""
+OPTIONS = ("sampler", "task options")
+"""Options in results.json, as Python writes objects, whose single values are told where they differ."""
 
 EPILOG = """\
 A and B are folders with results of `magnet test` or `magnet score`, on the same test scenes. Compared are the first
@@ -113,17 +117,13 @@ def show(
     names = rows if rows[0] != rows[1] else (f"{rows[0]} (A)", f"{rows[1]} (B)")
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     console.print(f"{names[0]} and {names[1]}, {len(common)} scenes of both ({units} independent)", style="bold")
+    apart = differing(settings(results, one, rows[0]), settings(second[0], other, rows[1]))
+    if apart:
+        console.print(f"settings differ: {apart}", markup=False, highlight=False, soft_wrap=True)
     found = {each: compared(one, other, rows, each, results.column(each).better, REFERENCES[0]) for each in metrics}
     console.print(table(results, names, found))
     lone = len(set(one.scenes) ^ set(other.scenes))
     notes = [f"{lone} scene{'s are' if lone > 1 else ' is'} in one of them alone and left out"] if lone else []
-    facts = [(key, one.facts.get(key), other.facts.get(key)) for key in SAME]
-    facts.append(("samples", samples(one, rows[0]), samples(other, rows[1])))
-    notes += [
-        f"not alike: {key}, {mine} and {theirs}"
-        for key, mine, theirs in facts
-        if mine != theirs and None not in (mine, theirs)
-    ]
     for note in [
         *notes,
         "an interval is of independent scenes, resampled for both alike; with under ten of them it is too narrow",
@@ -131,10 +131,41 @@ def show(
         console.print(note, style="dim")
 
 
-def samples(values: SceneValues, row: str) -> int | None:
-    """Of each scene, where it is known."""
+def settings(results: Results, values: SceneValues, row: str) -> dict[str, Any]:
+    """What decides how a row came about: its task, its number of samples, and single options of sampler and task."""
     said = values.facts.get("samples")
-    return said.get(row) if isinstance(said, dict) else said
+    found = {key: values.facts.get(key) for key in SAME}
+    found["samples"] = said.get(row) if isinstance(said, dict) else said
+    for key in OPTIONS:
+        found |= scalars(str(results.meta.get(key, "")))
+    return found
+
+
+def scalars(text: str) -> dict[str, Any]:
+    """Numbers, words and switches in what `repr` writes of options; those of options in options as `guidance.kind`."""
+    try:
+        node = ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError):
+        return {}
+    found: dict[str, Any] = {}
+    for each in node.keywords if isinstance(node, ast.Call) else []:
+        if isinstance(each.value, ast.Call):
+            found |= {f"{each.arg}.{key}": value for key, value in scalars(ast.unparse(each.value)).items()}
+        elif isinstance(each.value, ast.Constant | ast.UnaryOp):
+            with contextlib.suppress(ValueError):  # such as -inf
+                found[str(each.arg)] = ast.literal_eval(each.value)
+    return found
+
+
+def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
+    """Settings that both have and that differ, as "settle hold / firm, steps 16 / 8"; empty without any."""
+    plain = {True: "true", False: "false"}
+    words = []
+    for key, mine in first.items():
+        theirs = second.get(key)
+        if mine != theirs and None not in (mine, theirs):
+            words.append(f"{key} " + " / ".join(plain[v] if isinstance(v, bool) else str(v) for v in (mine, theirs)))
+    return ", ".join(words)
 
 
 def table(results: Results, names: tuple[str, str], found: Mapping[str, Difference]) -> Table:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from magnet import cli
-from magnet.cli import outputs
+from magnet.cli import compare, outputs
 from magnet.evaluation.by_scene import SceneValues
 from magnet.evaluation.results import Results
+from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 
 
 def results_in(folder: Path, worse: float = 0.0, scenes: int = 12, first: int = 0, **facts: object) -> Path:
@@ -40,7 +42,7 @@ def test_two_results_are_compared_over_their_scenes(tmp_path: Path, capsys: pyte
     (line,) = [line.split() for line in text.splitlines() if "MPJPE" in line]
     assert line[-5:] == ["-0.100", "[-0.100,", "-0.100]", "magnet", "(B)"]
     assert "MPJVE" not in text and "MPJVE" in said(capsys, one, other, "--full")
-    assert "not alike" not in text
+    assert "settings differ" not in text
     assert "cannot be told" in said(capsys, one, one / "scenes.json")
 
 
@@ -55,9 +57,20 @@ def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     text = said(capsys, one, results_in(tmp_path / "b", first=2, task="generation"))
     assert "10 scenes of both" in text
     assert "4 scenes are in one of them alone" in text, "the first two of one, the last two of the other"
-    assert "not alike: task, joint_future and generation" in text
-    assert "not alike: samples, 1 and 10" in text
+    assert "settings differ: task joint_future / generation, samples 1 / 10\n" in text
     assert "1 scene is in one of them alone" in said(capsys, one, results_in(tmp_path / "c", scenes=11))
+
+
+def test_options_that_differ_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    held = SamplerOptions(settle="hold", steps=16, smooth_path=True)
+    firm = SamplerOptions(settle="firm", steps=8, smooth_path=False, guidance=Guidance(weight=2.0))
+    one = results_in(tmp_path / "a", sampler=repr(held), seed=1, **{"task options": "Own(block=1, at=(0, 1))"})
+    other = results_in(tmp_path / "b", sampler=repr(firm), **{"task options": "Own(block=2, at=(0, 2), least=-inf)"})
+    text = said(capsys, one, other)
+    line = "steps 16 / 8, settle hold / firm, smooth_path true / false, guidance.weight 1.0 / 2.0, block 1 / 2"
+    assert f"settings differ: {line}\n" in text
+    assert "settings differ" not in said(capsys, one, one / "results.json")
+    assert compare.scalars("Mine(3) of x") == compare.scalars("") == {}, "a task whose repr is its own"
 
 
 @pytest.mark.parametrize(
