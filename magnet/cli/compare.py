@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     for folder, row, (_, values) in zip((given.folders[0], given.folders[-1]), rows, both, strict=True):
         if row not in values.rows:
             raise CommandError(no_such("row", row, list(values.rows), str(folder / "results.json")))
-    show(both[0], both[1], (rows[0], rows[1]), given.full)
+    show(both[0], both[1], (rows[0], rows[1]), given.full, given.folders)
     return 0
 
 
@@ -88,9 +88,13 @@ def read(folder: Path) -> tuple[Results, SceneValues]:
 
 
 def show(
-    first: tuple[Results, SceneValues], second: tuple[Results, SceneValues], rows: tuple[str, str], full: bool
+    first: tuple[Results, SceneValues],
+    second: tuple[Results, SceneValues],
+    rows: tuple[str, str],
+    full: bool,
+    folders: Sequence[Path],
 ) -> None:
-    """Print the table.
+    """Print what is compared, and the table.
 
     Raises:
         CommandError: no scene is in both, or no number.
@@ -114,9 +118,13 @@ def show(
     units = len(
         {unit if unit >= 0 else name for name, unit in zip(one.scenes, one.units, strict=True) if name in common}
     )
-    names = rows if rows[0] != rows[1] else (f"{rows[0]} (A)", f"{rows[1]} (B)")
+    names = (f"{rows[0]} (A)", f"{rows[1]} (B)") if len(folders) > 1 or rows[0] == rows[1] else rows
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     console.print(f"{names[0]} and {names[1]}, {len(common)} scenes of both ({units} independent)", style="bold")
+    for letter, folder, (said, _) in zip("AB", folders, (first, second), strict=False):
+        kept = said.meta.get("checkpoint")
+        trained = f", checkpoint {kept}" if kept not in (None, "None") else ""
+        console.print(f"{letter}: {folder}{trained}", markup=False, highlight=False, soft_wrap=True)
     apart = differing(settings(results, one, rows[0]), settings(second[0], other, rows[1]))
     if apart:
         console.print(f"settings differ: {apart}", markup=False, highlight=False, soft_wrap=True)
@@ -169,7 +177,10 @@ def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
 
 
 def table(results: Results, names: tuple[str, str], found: Mapping[str, Difference]) -> Table:
-    """A line each number: of both, the difference with its interval, and who is better where that can be told."""
+    """A line each number: of both, the difference with its interval, and who is better where that can be told.
+
+    The ground truth's value is shown where it decides that.
+    """
     from rich import box
     from rich.table import Table
 
@@ -177,12 +188,15 @@ def table(results: Results, names: tuple[str, str], found: Mapping[str, Differen
 
     made = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
     made.add_column("number", no_wrap=True)
-    for name in (*names, "difference", "95 %"):
-        made.add_column(name, justify="right")
+    real = any(each.truth == each.truth for each in found.values())
+    heads = [name.replace(" ", "\n") for name in names]  # in several lines, so that intervals have room in one
+    for name in (*heads, *(["ground\ntruth"] * real), "difference", "95 %"):
+        made.add_column(name, justify="right", no_wrap=True)
     made.add_column("better")
     for metric, each in found.items():
         interval = f"[{three(each.low)}, {three(each.high)}]" if each.low == each.low else "-"
-        numbers = (three(each.first), three(each.second), three(each.difference), interval)
+        truth = ["" if each.truth != each.truth else three(each.truth)] * real
+        numbers = (three(each.first), three(each.second), *truth, three(each.difference), interval)
         sure = "" if not results.column(metric).better else "cannot be told"
         made.add_row(results.title(metric), *numbers, sure if each.better is None else names[each.better])
     return made

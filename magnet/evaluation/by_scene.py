@@ -153,6 +153,8 @@ class Difference(NamedTuple):
     """Its interval; NaN with fewer than two units."""
     better: int | None
     """0 or 1: the first or the second is better, in almost all resamples; None: cannot be told."""
+    truth: float = math.nan
+    """The recordings' value, where it decides what is better; else NaN."""
 
 
 def compared(
@@ -180,8 +182,9 @@ def compared(
     np.add.at(sums, place, np.stack(parts, axis=1))
     sums = sums[(sums[..., 1] > 0).any(axis=1)]
     means = _means(sums.sum(axis=0))
+    recorded = means[2] if real else math.nan
     if len(sums) < 2 or np.isnan(means).any():
-        return Difference(means[0], means[1], means[1] - means[0], math.nan, math.nan, None)
+        return Difference(means[0], means[1], means[1] - means[0], math.nan, math.nan, None, recorded)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(sums), (RESAMPLES, len(sums)), generator=generator).numpy()
     times = np.stack([np.bincount(each, minlength=len(sums)) for each in drawn])  # (R, U)
@@ -195,7 +198,7 @@ def compared(
     if worse is not None:
         least, most = _ends(worse[:, 1] - worse[:, 0])
         sure = 1 if most < 0 else 0 if least > 0 else None
-    return Difference(means[0], means[1], means[1] - means[0], low, high, sure)
+    return Difference(means[0], means[1], means[1] - means[0], low, high, sure, recorded)
 
 
 def _means(sums: Floats) -> Floats:

@@ -73,6 +73,24 @@ def test_options_that_differ_are_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert compare.scalars("Mine(3) of x") == compare.scalars("") == {}, "a task whose repr is its own"
 
 
+def test_folders_and_the_ground_truth_that_decides_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [results_in(tmp_path / name, checkpoint=at) for name, at in (("a", "runs/1/last.ckpt"), ("b", "None"))]
+    for folder, hands in zip(folders, (0.9, 0.5), strict=True):
+        values = SceneValues.load(folder / "scenes.json")
+        for row, each in {"magnet": hands, "ground truth": 0.6}.items():
+            values.rows.setdefault(row, {})["hand_contact"] = np.full((12, 2), [each, 3.0])
+        values.save(folder / "scenes.json")
+    text = said(capsys, *folders)
+    assert f"\nA: {folders[0]}, checkpoint runs/1/last.ckpt\nB: {folders[1]}\n" in text
+    (line,) = [line.split() for line in text.splitlines() if "hands" in line]
+    assert line == ["hands", "→", "0.900", "0.500", "0.600", "-0.400", "[-0.400,", "-0.400]", "magnet", "(B)"]
+    (line,) = [line.split() for line in text.splitlines() if "MPJPE" in line]
+    assert line[3] == line[4] and line[5] == "0", "no ground truth of what is best when low"
+    assert " ground " in text and " ground " not in said(capsys, results_in(tmp_path / "c"), "--rows", "NN", "magnet")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
