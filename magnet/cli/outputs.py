@@ -6,6 +6,7 @@ import json
 import math
 import re
 import sys
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def write_scenes(
     for batch in predicted:
         for first in range(0, batch.scenes, evaluator.samples):
             scene = batch.select(slice(first, first + evaluator.samples)).to("cpu")
-            name = f"{rank}{number:04d}{_safe(scene)}"
+            name = f"{rank}{number:04d}{file_part(scene)}"
             scene.save(folder / "scenes" / f"{name}.npz")
             if picture != "none" and number < pictures and evaluator.global_rank == 0:
                 shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
@@ -125,6 +126,8 @@ def write_scenes(
     print(f"written: {number} scenes of {evaluator.samples} samples to {folder / 'scenes'}")
 
 
-def _safe(scene: Scene) -> str:
-    name = re.sub(r"[^A-Za-z0-9]+", "_", scene.names[0] if scene.names else "").strip("_")
+def file_part(scene: Scene) -> str:
+    """Its name for a file's, behind `_`: letters and digits of any script, an accent as part of its letter."""
+    name = unicodedata.normalize("NFC", scene.names[0] if scene.names else "")
+    name = re.sub(r"[\W_]+", "_", name).strip("_")
     return f"_{name}" if name else ""

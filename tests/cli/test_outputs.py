@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from magnet.cli import outputs
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results
+from magnet.testing.models import random_scene
 from tests.evaluation.test_evaluator import data, run
 
 
@@ -35,3 +37,17 @@ def test_files_hold_everything_whatever_is_printed(
     assert ("--full" in printed) != full
     widest = max(map(len, printed.split("FD (m²)")[0].splitlines()))
     assert widest <= outputs.WIDE
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("Été à Séville 4[0:122]", "_Été_à_Séville_4_0_122"),
+        ("E\u0301te\u0301/1", "_Été_1"),  # accents as signs of their own, as some systems write them
+        ("社交ダンス #2", "_社交ダンス_2"),
+        ("take_03 [30:60]", "_take_03_30_60"),
+        ("../?", ""),
+    ],
+)
+def test_letters_of_any_script_stay_in_the_names_of_files(name: str, kept: str) -> None:
+    assert outputs.file_part(random_scene(1, 1, 1, torch.Generator()).replace(names=(name,))) == kept
