@@ -215,7 +215,10 @@ def run_info(given: argparse.Namespace) -> int:
 def run_check(given: argparse.Namespace) -> int:
     from magnet.datamodules.preparing import check
     from magnet.datamodules.store.reader import MANIFEST, STATE
+    from magnet.files import require_place
 
+    if given.picture not in (None, "none"):
+        require_place(given.picture)
     path = Path(needed(given, "path")[0]).expanduser()
     if (path / MANIFEST).exists() or (path / STATE).is_dir():
         found, body = checked_store(given, path)

@@ -93,6 +93,16 @@ def with_checkpoint(settings: Any, command: str, checkpoint: Path | None) -> Any
     return changed
 
 
+def require_folder(folder: Path) -> None:
+    """Refuse a run's folder that cannot be made or written, before loggers, which say less of it, begin.
+
+    Raises:
+        CannotWrite: it is such a one.
+    """
+    if first_process():
+        require_place(folder / "run.json")
+
+
 def checkpoints(folder: Path, model: LightningModule, callbacks: Sequence[Callback] = ()) -> list[Callback]:
     """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt`.
 

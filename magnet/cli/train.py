@@ -271,6 +271,7 @@ class MagnetCLI(LightningCLI):
         if fit and logger and not any(isinstance(c, LearningRateMonitor) for c in callbacks):
             callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
+            run_folder.require_folder(self.folder)
             callbacks = [StepNumbers(), *callbacks, Duration(), optimizers.SameOptimizer(self.checkpoint)]
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False

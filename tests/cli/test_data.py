@@ -63,6 +63,18 @@ def test_a_download_is_recognised_checked_and_drawn(copy, capsys):
     assert (copy / "dd100_check.png").stat().st_size > 10_000
 
 
+def test_a_place_that_cannot_be_made_is_said_before_the_work(copy, capsys):
+    if not Path("/proc/self").exists():
+        pytest.skip("no /proc here")
+    words = ["--root", "dl", "--out", "/proc/store", "--body", "dl/body.npz"]
+    assert cli.main(["data", "prepare", "dd100", *words]) == 2
+    said = capsys.readouterr().err
+    assert "/proc/store: cannot be made (" in said and "choose another --out" in said and "Errno" not in said
+    assert cli.main(["data", "check", "store", "--picture", "/proc/store/seen.png"]) == 2
+    said = capsys.readouterr()
+    assert "/proc/store/seen.png: /proc/store cannot be made (" in said.err and not said.out
+
+
 def test_a_check_is_drawn_with_the_open_body_where_the_own_is_not_given(copy, capsys):
     assert cli.main(["data", "check", "store", "--picture", "seen.png"]) == 0
     assert "picture: seen.png" in capsys.readouterr().out

@@ -11,6 +11,7 @@ import pytest
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from magnet import cli
 from magnet.cli import run_folder
 from magnet.files import CannotWrite
 from tests.toys import ToyData, ToyModel
@@ -113,3 +114,16 @@ def test_beside_a_users_own_a_measure_that_is_not_logged_stops_no_training(tmp_p
     words = {"logger": False, "accelerator": "cpu", "enable_progress_bar": False}
     Trainer(max_epochs=1, callbacks=callbacks, **words).fit(model, ToyData())
     assert {path.name for path in tmp_path.rglob("*.ckpt")} == {"mine.ckpt", "last.ckpt"}
+
+
+@pytest.mark.parametrize("more", [(), ("--trainer.enable_checkpointing", "false")])
+def test_a_training_whose_folder_cannot_be_made_says_so(
+    toy: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...]
+) -> None:
+    if not Path("/proc/self").exists():
+        pytest.skip("no /proc here")
+    words = ("--model", "ToyModel", "--data", "ToyData", "--trainer.accelerator", "cpu", "--out", "/proc/store")
+    assert cli.main(["fit", *words, *more]) == 2
+    said = capsys.readouterr().err
+    assert "/proc/store/run.json: /proc/store cannot be made" in said and "choose another place" in said
+    assert "Errno" not in said

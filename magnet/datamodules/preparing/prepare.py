@@ -23,7 +23,7 @@ from magnet.datamodules.preparing.convert import (
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
-from magnet.files import alone, file_hash, write_whole, writing
+from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
 
 SHARD_ROWS = 2**18
 """Rows of a shard at most, 49 MB; small enough that ten million frames spread over some forty processes."""
@@ -74,8 +74,7 @@ def prepare(
     out = Path(out).expanduser()
     opened(out, reader)  # a stranger's folder is refused before anything is made in it
     state = out / STATE
-    with writing(out, "choose another --out"):
-        state.mkdir(parents=True, exist_ok=True)
+    make_state(out)
     with writing(out, ON_FULL), locked(state):
         old = opened(out, reader)  # again: whoever held the lock before may have made a new store
         settings = job.settings(body)
@@ -209,6 +208,19 @@ def read_splits(path: str | Path) -> dict[str, Split]:
 
 
 # -- what lies in the folder -------------------------------------------------------------------
+
+
+def make_state(out: Path) -> None:
+    """The store's folder, with one in it for what is not finished.
+
+    Raises:
+        CannotWrite: it cannot be made.
+    """
+    with writing(out, "choose another --out"):
+        try:
+            (out / STATE).mkdir(parents=True, exist_ok=True)
+        except FileNotFoundError as error:  # in /proc, for example
+            raise CannotWrite(f"{out}: cannot be made ({error.strerror}); choose another --out") from error
 
 
 def opened(out: Path, reader: Reader) -> StoreReader | None:
