@@ -191,9 +191,9 @@ class Model:
         if context is not None:
             require_whole("context", context)
         given = scene.frames if context is None else min(scene.frames, context)
-        given = given // TOKEN_FRAMES * TOKEN_FRAMES
         if given < TOKEN_FRAMES:
             raise ValueError(f"to go on, the model needs {TOKEN_FRAMES} frames or more; got {max(given, 0)}")
+        given = given // TOKEN_FRAMES * TOKEN_FRAMES
         scene = scene.slice(scene.frames - given)
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         return self.predict(scene, "joint_future", context=given, frames=frames, **said)

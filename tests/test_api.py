@@ -287,6 +287,8 @@ def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
         model.react(duet, context=64)
     with pytest.raises(ValueError, match="needs 4 frames or more; got 0"):
         model.continue_(duet, context=0)
+    with pytest.raises(ValueError, match="needs 4 frames or more; got 2"):
+        model.continue_(duet.slice(0, 2))
     with pytest.raises(ValueError, match="samples: got 0, expected at least 1"):
         model.continue_(duet, samples=0)
     with pytest.raises(ValueError, match="frames: got 0, expected at least 1"):

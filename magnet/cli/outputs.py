@@ -123,7 +123,12 @@ def write_scenes(
     for path in pictured:
         print("written:", path)
     print(cost(facts["sampling"]))
-    print(f"written: {number} scenes of {evaluator.samples} samples to {folder / 'scenes'}")
+    print(f"written: {counted(number, 'scene')} of {counted(evaluator.samples, 'sample')} to {folder / 'scenes'}")
+
+
+def counted(number: int, what: str) -> str:
+    """As "1 scene", "2 scenes"."""
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def file_part(scene: Scene) -> str:

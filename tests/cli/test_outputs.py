@@ -12,7 +12,7 @@ from magnet.cli import outputs
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results
 from magnet.testing.models import random_scene
-from tests.evaluation.test_evaluator import data, run
+from tests.evaluation.test_evaluator import data, predicted, run
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,15 @@ def test_files_hold_everything_whatever_is_printed(
     assert ("--full" in printed) != full
     widest = max(map(len, printed.split("FD (m²)")[0].splitlines()))
     assert widest <= outputs.WIDE
+
+
+def test_scenes_and_samples_are_counted_in_words_that_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clips = data()
+    scene, evaluator = predicted(clips, samples=1)
+    outputs.write_scenes([scene], evaluator, clips, tmp_path, "none", 0)
+    assert f"written: {scene.scenes} scenes of 1 sample to {tmp_path / 'scenes'}\n" in capsys.readouterr().out
+    outputs.write_scenes([scene.select([0])], evaluator, clips, tmp_path, "none", 0)
+    assert "written: 1 scene of 1 sample to" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
