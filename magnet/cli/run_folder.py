@@ -124,6 +124,18 @@ def checkpoints(folder: Path, model: LightningModule, callbacks: Sequence[Callba
     return [last, kind(place, "best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False)]
 
 
+def what_is_left(folder: Path, trainer: Trainer, model: LightningModule) -> str:
+    """Where a training that is over is, in words, its checkpoint, and why that is not the best one."""
+    files = {name: folder / "checkpoints" / f"{name}.ckpt" for name in ("best", "last")}
+    name = next((name for name, file in files.items() if file.exists()), None)
+    if name is None:
+        return f"the run is in {folder}"
+    monitor = getattr(model, "monitor", MONITOR)
+    none = name == "last" and monitor not in trainer.callback_metrics
+    why = f"; there is no best.ckpt, because no validation measured {monitor}" if none else ""
+    return f"the run is in {folder}; its {name} checkpoint: {files[name]}{why}"
+
+
 class BestCheckpoint(ModelCheckpoint):
     """Stands beside a user's own, which may measure the same; writes nothing where a model does not log its measure.
 

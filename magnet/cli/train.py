@@ -60,6 +60,7 @@ SILENCED = (
     ".*callbacks used to create the checkpoint need to be provided.*",
     ".*The dirpath has changed.*",
     ".*in eval mode at the start of training.*",
+    ".*could not find the monitored key.*",  # before a validation; `run_folder.what_is_left` says so
 )
 """Warnings of Lightning's that do not apply to this command."""
 UNSAID = ("Tip:", "`weights_only` was not set")
@@ -357,9 +358,7 @@ class MagnetCLI(LightningCLI):
     def after_fit(self) -> None:
         """Say where things are."""
         if self.trainer.is_global_zero and not getattr(self.trainer, "fast_dev_run", False):
-            files = {name: self.folder / "checkpoints" / f"{name}.ckpt" for name in ("best", "last")}
-            kept = next((f"; its {name} checkpoint: {file}" for name, file in files.items() if file.exists()), "")
-            print(f"the run is in {self.folder}{kept}")
+            print(run_folder.what_is_left(self.folder, self.trainer, self.model))
 
     def after_validate(self) -> None:
         """Show what was logged."""

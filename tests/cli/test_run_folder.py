@@ -127,3 +127,18 @@ def test_a_training_whose_folder_cannot_be_made_says_so(
     said = capsys.readouterr().err
     assert "/proc/store/run.json: /proc/store cannot be made" in said and "choose another place" in said
     assert "Errno" not in said
+
+
+def test_a_training_without_a_validation_says_why_it_has_no_best_checkpoint(
+    toy: Path, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+) -> None:
+    words = ("--model", "ToyModel", "--data", "ToyData", "--trainer.accelerator", "cpu", "--out", "run")
+    assert cli.main(["fit", *words, "--trainer.max_steps", "1", "--trainer.limit_val_batches", "0"]) == 0
+    said = capsys.readouterr()
+    last = Path("run/checkpoints/last.ckpt")
+    why = "there is no best.ckpt, because no validation measured val/loss"
+    assert last.exists() and f"the run is in run; its last checkpoint: {last}; {why}\n" in said.out
+    assert not any("monitored key" in str(each.message) for each in recwarn)
+    assert cli.main(["fit", *words[:-1], "other", "--trainer.max_steps", "3"]) == 0
+    said = capsys.readouterr()
+    assert "its best checkpoint: " in said.out and "no best.ckpt" not in said.out
