@@ -61,6 +61,13 @@ class Denoiser(DenoiserCore, TokenModel):
 
     def setup(self, stage: str) -> None:
         self.graphed = None  # of a training that was interrupted; it cannot be copied
+        stride = self.sampling.stride or 0
+        if stage == "fit" and stride > self.window:
+            raise ValueError(
+                f"sampling.stride {stride}: is more token steps than the window of {self.window} has, so the "
+                f"model could not be sampled; set --data.window_frames {TOKEN_FRAMES * stride} or more, as "
+                f"of the model that it starts from, or --model.sampling.stride {self.window} or less"
+            )
         super().setup(stage)
 
     def on_fit_end(self) -> None:

@@ -195,3 +195,8 @@ def test_absent_agents_cost_nothing(generator):
     moved = scene.replace(T_world_root=scene.T_world_root.clone())
     moved.T_world_root[:, :, 2, :3, 3] += 5.0
     assert torch.equal(loss(scene), loss(moved))
+
+
+def test_a_model_that_could_not_be_sampled_is_not_trained(tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"sampling\.stride 99: is more token steps than the window of \d+ has"):
+        fitted(build(tmp_path, sampling={"stride": 99}), 1)
