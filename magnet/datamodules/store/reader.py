@@ -206,6 +206,12 @@ class StoreReader:
             self.manifest: dict[str, Any] = json.loads((self.path / MANIFEST).read_text(encoding="utf-8"))
             version = self.manifest["format"]
         except FileNotFoundError as error:
+            if not self.path.exists():
+                here = "" if self.path.is_absolute() else f" in {Path.cwd()}, where paths of a configuration count from"
+                raise StoreError(
+                    f"{self.path}: no such folder{here}; if the store lies elsewhere, give it with --data.path, else "
+                    f"{_advice(self.path)}"
+                ) from error
             raise StoreError(
                 f"{self.path} is not a prepared store: it has no {MANIFEST}; {_advice(self.path)}"
             ) from error

@@ -98,6 +98,10 @@ def test_a_damaged_shard_is_named(store, spoil, tmp_path):
 def test_what_is_no_store_is_refused_with_the_command(store, tmp_path):
     with pytest.raises(ValueError, match=r"no store was given; magnet data prepare made --root"):
         made.Made().prepare_data()
+    with pytest.raises(
+        StoreError, match=r"gone: no such folder in .*, where paths .*give it with --data\.path, else make"
+    ):
+        StoreReader("gone")
     with pytest.raises(StoreError, match=r"not a prepared store.*magnet data prepare made --root"):
         made.Made(str(tmp_path)).prepare_data()
     with pytest.raises(ValueError, match=r"prepared with body 'made-up-smplx'.*--data\.body_model"):
