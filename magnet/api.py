@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def load(
 
 
 def read(
-    *paths: str | Path | Sequence[str | Path],
+    *paths: str | Path | Iterable[str | Path],
     body: str | Path | Body | None = None,
     fps: float | None = FPS,
     trim: bool = False,
@@ -104,8 +104,10 @@ def read(
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
     options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
-    files: list[Any] = [file for each in paths for file in (each if isinstance(each, list | tuple) else [each])]
-    if strange := [file for file in files if not isinstance(file, str | Path)]:
+    one = (str, Path)
+    lists = [[each] if isinstance(each, one) or not isinstance(each, Iterable) else each for each in paths]
+    files = [file for each in lists for file in each]
+    if strange := [file for file in files if not isinstance(file, one)]:
         raise ValueError(f"paths: got {type(strange[0]).__name__}, expected files' names, or lists of them")
     got = reading.read(files, body, options)
     for warning in reading.warned(got.notes):

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -187,6 +186,8 @@ def alone(lock: Path, taken: str) -> Iterator[None]:
     Raises:
         Taken: another process has it.
     """
+    from filelock import FileLock, Timeout  # brings asyncio, which the first words of a command need not wait for
+
     try:
         held = FileLock(lock, timeout=0).acquire()
     except Timeout as error:

@@ -126,8 +126,12 @@ def announce(port: int, host: str, quiet: bool) -> None:
 def _check(options: argparse.Namespace) -> None:
     if not options.files and not options.live:
         raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
-    for goes_with, names in (("--live or --record", GENERATE), ("--live", ONLY_LIVE), ("--record", ONLY_RECORD)):
-        chosen = (options.live and "--live" in goes_with) or (options.record is not None and "--record" in goes_with)
+    live, record = options.live, options.record is not None
+    for names, chosen, goes_with in (
+        (GENERATE, live or record, "--live or --record"),
+        (ONLY_LIVE, live, "--live"),
+        (ONLY_RECORD, record, "--record"),
+    ):
         if not chosen and (name := next((name for name in names if name in options.said), None)):
             raise ValueError(f"--{name}: goes with {goes_with}; leave it out, or add that")
     if options.live and (name := next((name for name in NOT_LIVE if name in options.said), None)):

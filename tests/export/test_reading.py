@@ -231,3 +231,12 @@ def test_what_is_only_written_is_said_to_be_so(suffix: str, tmp_path: Path) -> N
 def test_options_that_cannot_be_are_refused_in_one_line(options: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         reading.Reading(**options)
+
+
+def test_files_come_one_by_one_in_lists_or_as_a_folder_gives_them(duet: Scene, tmp_path: Path) -> None:
+    formats.write(duet, tmp_path / "a.bvh")
+    paths = sorted(tmp_path.glob("*.bvh"))
+    for given in (paths, [paths], [iter(paths)]):
+        assert magnet.read(*given).agents == 2
+    with pytest.raises(ValueError, match="paths: got int, expected files' names, or lists of them"):
+        magnet.read(3)  # type: ignore[arg-type]
