@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import tempfile
 import zipfile
@@ -110,6 +111,44 @@ def _try_folder(path: Path) -> None:
         for each in made:
             with suppress(OSError):  # somebody else may have put something there
                 each.rmdir()
+
+
+@contextmanager
+def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Path]:
+    """A path beside `path`, of the same suffix, that takes its place when the block ends well; its folder is made.
+
+    So what was there before stays where the disk is full or somebody interrupts, and no half file is left. What is no
+    plain file, such as `/dev/null`, is written as it is, and so is a file in a folder that takes no other.
+
+    Args:
+        path: the file that the block writes; of a link, the file that it leads to.
+        advice: what to do if the disk is full.
+
+    Raises:
+        CannotWrite: the disk is full, or the folder does not take files.
+    """
+    path = Path(path)
+    with writing(path, advice):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        target = Path(os.path.realpath(path))
+        if target.exists() and not (target.is_file() and os.access(target.parent, os.W_OK)):
+            yield path
+            return
+        part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
+        try:
+            yield part
+            if target.exists():
+                shutil.copymode(target, part)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """A text file of UTF-8, whole or not at all; see `whole`. Returns the path."""
+    with whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return Path(path)
 
 
 class HashedFile:
@@ -262,8 +301,8 @@ def npz_path(path: str | Path, others: str) -> Path:
 
 
 def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write a compressed npz under exactly this name: numpy adds .npz to names that end in .NPZ."""
-    with path.open("wb") as file:
+    """Write a whole compressed npz under exactly this name: numpy adds .npz to names that end in .NPZ."""
+    with whole(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
 
 

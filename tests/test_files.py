@@ -13,7 +13,18 @@ import numpy as np
 import pytest
 
 from magnet import files
-from magnet.files import CannotWrite, inside, load_npz, npz_path, regular, require_place, write_whole, writing
+from magnet.files import (
+    CannotWrite,
+    inside,
+    load_npz,
+    npz_path,
+    regular,
+    require_place,
+    whole,
+    write_text,
+    write_whole,
+    writing,
+)
 
 HERE = "choose another --out"
 
@@ -109,6 +120,36 @@ def _failing(write):  # type: ignore[no-untyped-def]
         return write(self, data)
 
     return begin
+
+
+def test_a_file_takes_its_place_when_it_is_whole(tmp_path: Path) -> None:
+    kept = write_text(tmp_path / "new" / "a.txt", "before")
+    kept.chmod(0o640)
+    link = tmp_path / "link.txt"
+    link.symlink_to(kept)
+    with pytest.raises(KeyboardInterrupt), whole(link) as part:
+        assert part.suffix == ".txt" and part.parent == kept.parent
+        part.write_text("half")
+        raise KeyboardInterrupt
+    assert kept.read_text() == "before" and [path.name for path in kept.parent.iterdir()] == ["a.txt"]
+    assert write_text(link, "after") == link and link.is_symlink()
+    assert kept.read_text() == "after" and kept.stat().st_mode & 0o777 == 0o640
+    (tmp_path / "plain").touch()
+    assert write_text(tmp_path / "other", "").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_what_is_no_plain_file_is_written_as_it_is() -> None:
+    with whole("/dev/null") as part:
+        assert part == Path("/dev/null")
+
+
+def test_a_file_in_a_folder_that_takes_no_other_is_still_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = write_text(tmp_path / "a", "before")
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with whole(there) as part:
+        assert part == there
 
 
 # -- reading -----------------------------------------------------------------------------------

@@ -190,7 +190,8 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
     report = process.report.told(member, gate, process.pace)
     print(json.dumps(report))
     if given.report is not None:
-        given.report.parent.mkdir(parents=True, exist_ok=True)
-        given.report.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        from magnet.files import write_text
+
+        write_text(given.report, json.dumps(report, indent=1) + "\n")
     if given.out is not None and told:
         print(f"written: {cat_time([motion_of(each.poses, each.betas) for each in told]).save(given.out)}")

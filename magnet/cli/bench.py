@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if given.live is not None and not 0 <= given.live < float("inf"):
         raise CommandError(f"--live is {given.live:g}, expected seconds, 0 for none")
     if given.out is not None:
-        from magnet.files import require_place  # imports NumPy, which --help need not wait for
+        from magnet.files import require_place, write_text  # imports NumPy, which --help need not wait for
 
         require_place(given.out)
     then = None if given.compare is None else read(given.compare)
@@ -88,8 +88,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         torch.set_num_threads(given.threads)
     found = run(given, of_tasks)
     if given.out is not None:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        write_text(given.out, json.dumps(found, indent=1) + "\n")
         print(f"written: {given.out}")
     if then is not None:
         print(compared(then, found))

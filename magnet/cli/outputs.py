@@ -18,6 +18,7 @@ from rich.table import Table
 from magnet.cli.provenance import machine, provenance
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results, print_table
+from magnet.files import write_text
 from magnet.motion.scene import Scene
 
 PANELS = 4
@@ -83,11 +84,10 @@ def cost(stats: dict[str, float]) -> str:
 def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
     """Print and write what a module without an evaluation of its own has logged."""
     values = {name: float(value) for name, value in sorted(trainer.callback_metrics.items())}
-    folder.mkdir(parents=True, exist_ok=True)
     plain = {name: value if math.isfinite(value) else None for name, value in values.items()}
-    (folder / "results.json").write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / "results.json", json.dumps(plain, indent=2) + "\n")
     lines = ["metric,value", *(f"{name},{value!r}" for name, value in values.items())]
-    (folder / "results.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(folder / "results.csv", "\n".join(lines) + "\n")
     table = Table("metric", "value", title=command, title_justify="left", header_style="bold")
     for name, value in values.items():
         table.add_row(name, f"{value:.6g}")
@@ -119,7 +119,7 @@ def write_scenes(
                 pictured.append(contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
     facts = evaluator.facts() | provenance() | {"machine": machine()}
-    (folder / f"{rank}sampling.json").write_text(json.dumps(facts, indent=2, default=str) + "\n", encoding="utf-8")
+    write_text(folder / f"{rank}sampling.json", json.dumps(facts, indent=2, default=str) + "\n")
     for path in pictured:
         print("written:", path)
     print(cost(facts["sampling"]))

@@ -114,10 +114,11 @@ def main(arguments: Sequence[str] = ()) -> int:
     show_some([f"still over 5 cm: {each}" for each in left(refined, got.body)], NAMED, ", less deep")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
+        from magnet.files import write_text
+
         plot = Path(options.plot)
         was, now = (curves(scene, got.body) for scene in (before, refined))
-        plot.parent.mkdir(parents=True, exist_ok=True)
-        plot.write_text(drawn(was, now, got.scene.fps), encoding="utf-8")
+        write_text(plot, drawn(was, now, got.scene.fps))
         scene_files.say_written([plot])
     return 0
 

@@ -23,7 +23,7 @@ from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.errors import CommandError
 from magnet.cli.pipes import output_closed
 from magnet.cli.provenance import provenance
-from magnet.files import require_place
+from magnet.files import require_place, write_text
 from magnet.version import __version__
 
 MONITOR = "val/loss"
@@ -358,10 +358,8 @@ class Record(Callback):
                     (self.folder / f"{name}.{suffix}").replace(self.folder / f"{name}-{before}.{suffix}")
         # What is measured in a training's folder is recorded beside the training, which goes on as it was.
         own = f"-{self.command}" if self.command != "fit" and (self.folder / "checkpoints").is_dir() else ""
-        (self.folder / f"config{own}.yaml").write_text(self.config, encoding="utf-8")
-        (self.folder / f"run{own}.json").write_text(
-            json.dumps(provenance() | self.facts, indent=2) + "\n", encoding="utf-8"
-        )
+        write_text(self.folder / f"config{own}.yaml", self.config)
+        write_text(self.folder / f"run{own}.json", json.dumps(provenance() | self.facts, indent=2) + "\n")
 
     on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.evaluation.scoring import Sight, planned
-from magnet.files import writing
+from magnet.files import save_npz
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.tasks import registry
 from magnet.tasks.base import Task
@@ -146,7 +145,5 @@ def write_inputs(benchmark: Benchmark, datamodule: MotionDataModule, task: str, 
         parts["betas"].append(batch.betas)
     arrays: dict[str, Any] = {key: torch.cat(each).numpy() for key, each in parts.items()}
     facts: dict[str, Any] = {"fps": benchmark.fps, "benchmark": benchmark.label, "task": task, "scenes": names}
-    with writing(path, "choose another file"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, known=known.numpy(), scored=scored.numpy(), **arrays, **facts)
+    save_npz(path, {"known": known.numpy(), "scored": scored.numpy(), **arrays, **facts})
     return path

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torchmetrics import MetricCollection
 from torchmetrics.utilities import dim_zero_cat
 
+from magnet.files import write_text
 from magnet.metrics import Better, ClipMeans
 
 Floats = NDArray[np.float64]
@@ -51,11 +52,8 @@ class SceneValues:
             method: {metric: _written(values) for metric, values in row.items()} for method, row in self.rows.items()
         }
         content = {"format": BY_SCENE_FORMAT, "facts": self.facts, "scenes": self.scenes, "units": self.units}
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(content | {"rows": rows}, ensure_ascii=False, allow_nan=False, default=str)
-        path.write_text(text + "\n", encoding="utf-8")
-        return path
+        return write_text(path, text + "\n")
 
     @staticmethod
     def load(path: str | Path) -> SceneValues:

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from magnet.evaluation.by_scene import SceneValues
+from magnet.files import whole, write_text
 from magnet.metrics import Better, Column, all_metrics, column, columns_of
 from magnet.metrics.columns import part_notes
 
@@ -98,7 +99,7 @@ class Results:
         rows = {m: {k: v if math.isfinite(v) else None for k, v in row.items()} for m, row in self.rows.items()}
         columns = {name: shown._asdict() for name, shown in self.columns.items()}
         content = {"format": RESULTS_FORMAT, "meta": self.meta, "columns": columns, "rows": rows}
-        return _write(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False, default=str) + "\n")
+        return write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False, default=str) + "\n")
 
     @staticmethod
     def load_json(path: str | Path) -> Results:
@@ -120,9 +121,7 @@ class Results:
 
     def save_csv(self, path: str | Path) -> Path:
         """One line a number: method, metric, value, low, high; full precision, without meta."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(("method", "metric", "value", "low", "high"))
             for method, row in self.rows.items():
@@ -130,7 +129,7 @@ class Results:
                     if metric in row:
                         span = self.interval(method, metric) or ("", "")
                         writer.writerow((method, metric, self.value(method, metric), *span))
-        return path
+        return Path(path)
 
     @staticmethod
     def load_csv(path: str | Path) -> Results:
@@ -264,10 +263,3 @@ def three(value: float) -> str:
     if digits > 6:
         return f"{value:.2e}"
     return f"{round(value, digits):.{max(digits, 0)}f}"
-
-
-def _write(path: str | Path, text: str) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return path

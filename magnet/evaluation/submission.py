@@ -18,7 +18,7 @@ from magnet.evaluation.benchmark import Benchmark
 from magnet.evaluation.plausible import doubts, require_people
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import TRAINING, TRUTH, UNALIGNED, Scoring, generators_of
-from magnet.files import load_npz, writing
+from magnet.files import load_npz, save_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 KEYS = ("benchmark", "task", "method", "fps", "scenes", "joints")
@@ -67,9 +67,7 @@ class Submission:
             "scenes": list(self.scenes),
             "joints": self.joints.float().numpy(),
         }
-        with writing(path, "choose another file"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(path, **arrays)
+        save_npz(path, arrays)
         return path
 
     @staticmethod

@@ -14,6 +14,7 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.joints import HEAD, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
 from magnet.export.bones import Names, bone_names
+from magnet.files import write_text
 from magnet.motion.required import require_body, require_one
 from magnet.motion.scene import Scene
 
@@ -62,7 +63,6 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
     if not people.scenes:
         raise ValueError("nobody is present in the scene, so there is no skeleton to write")
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     written = []
     for p, each in enumerate(paths_of(path, scene.present[0].nonzero()[:, 0].tolist())):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
@@ -75,10 +75,8 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
             for place, angles in zip(position, degrees, strict=True)
         ]
         tips = {joint: PER_METRE[unit] * np.array(tip) for joint, tip in TIPS.items()}
-        each.write_text(
-            bvh_text(bone_names(names), PARENTS, offsets, tips, ROTATIONS, rows, scene.fps), encoding="utf-8"
-        )
-        written.append(each)
+        text = bvh_text(bone_names(names), PARENTS, offsets, tips, ROTATIONS, rows, scene.fps)
+        written.append(write_text(each, text))
     return written
 
 

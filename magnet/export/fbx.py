@@ -13,6 +13,7 @@ from pathlib import Path
 from magnet.body import Body
 from magnet.export.bones import BoneOptions
 from magnet.export.glb import save_glb
+from magnet.files import whole
 from magnet.motion.scene import Scene
 
 SCRIPT = Path(__file__).with_name("as_fbx.py")
@@ -50,7 +51,6 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     """
     command = blender()
     path = Path(path) if Path(path).suffix.lower() == ".fbx" else Path(path).with_suffix(".fbx")
-    path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         glb, made = save_glb(scene, Path(folder) / "scene.glb", body, bones), Path(folder) / "scene.fbx"
         words = [*command, str(SCRIPT), "--", str(glb), str(made), f"{scene.fps:g}"]
@@ -58,5 +58,6 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         if done.returncode or not made.exists():
             said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
             raise ValueError(f"{path}: Blender ({command[0]}) could not write it: {said}")
-        shutil.move(made, path)
+        with whole(path) as part:
+            shutil.copyfile(made, part)
     return path

@@ -16,6 +16,7 @@ from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
+from magnet.files import whole
 from magnet.motion.frames import canonical_frame, inverse
 from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import to_quat
@@ -49,7 +50,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     skin = gltf.skin_of(body)
     times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
     shaped: dict[bytes, dict[str, int]] = {}
-    whole = _animation("motion")
+    scene_clip = _animation("motion")
     for slot in slots:
         betas = scene.betas[0, slot].detach().cpu().float()
         shape = shaped.setdefault(betas.numpy().tobytes(), {})
@@ -57,7 +58,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
             shape |= gltf.shape_of(body, betas)
         pelvis, floor = gltf.person(slot, standing(body, betas), {**skin, **shape}, bones)
         T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu()
-        clip = whole if bones.clips == "scene" else _animation(f"person_{slot}")
+        clip = scene_clip if bones.clips == "scene" else _animation(f"person_{slot}")
         if floor is not None:
             T_world_floor = canonical_frame(T_above_pelvis)
             T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
@@ -67,10 +68,10 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         if bones.clips == "person":
             gltf.document["animations"].append(clip)
     if bones.clips == "scene":
-        gltf.document["animations"].append(whole)
+        gltf.document["animations"].append(scene_clip)
     path = Path(path) if Path(path).suffix.lower() == ".glb" else Path(path).with_suffix(".glb")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(gltf.packed())
+    with whole(path) as part:
+        part.write_bytes(gltf.packed())
     return path
 
 

@@ -86,7 +86,6 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     }
     path = Path(path)
     path = path if path.suffix.lower() == ".npz" else path.with_suffix(".npz")
-    path.parent.mkdir(parents=True, exist_ok=True)
     if not apart:
         save_npz(path, arrays | facts)
         return [path]

@@ -12,6 +12,7 @@ from magnet.body import Body
 from magnet.export.cast import Scenes, Style, cast, default_body, known_frames, panels
 from magnet.export.drawing import INK, Camera, Size, drawable, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
+from magnet.files import whole
 
 
 def contact_sheet(
@@ -75,8 +76,8 @@ def contact_sheet(
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"{path.name}: pictures are written as .png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    page.save(path)
+    with whole(path) as part:
+        page.save(part)
     return path
 
 

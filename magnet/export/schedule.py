@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from magnet.export.drawing import AGENTS, CONTEXT, INK, PALE, Colour, drawable, font
+from magnet.files import whole
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.schedule import MaskSchedule, initial_levels
 
@@ -195,8 +196,8 @@ def draw_schedule(
             draw.rounded_rectangle(frame, radius=4 * unit, outline=WINDOW, width=unit)
     for number, line in enumerate(lines):
         _key(draw, line, bottom + unit * (10 + 20 * number), plan)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    page.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    with whole(path) as part:
+        page.quantize(128, dither=Image.Dither.NONE).save(part, optimize=True)
     return path
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.files import load_npz
+from magnet.files import load_npz, save_npz
 from magnet.motion.scene import Scene, cat_time, require_rotations
 
 FORMAT = 1
@@ -56,13 +56,12 @@ class DenoisingTrace:
     def save(self, path: str | Path) -> Path:
         """Write one npz that needs no unpickling. Returns the path written."""
         path = Path(path).with_suffix(".npz")
-        path.parent.mkdir(parents=True, exist_ok=True)
         meta = {"recording": FORMAT, "fps": self.scene.fps, "body": self.scene.body, "names": list(self.scene.names)}
         arrays: dict[str, Any] = {name: value.cpu().numpy() for name, value in self.scene.tensors().items()}
         arrays["levels"], arrays["start"] = self.levels.numpy(), self.start.numpy()
         arrays["estimate_body_rot"] = self.estimates.body_rot.half().cpu().numpy()
         arrays["estimate_T_world_root"] = self.estimates.T_world_root.cpu().numpy()
-        np.savez_compressed(path, meta=np.array(json.dumps(meta)), **arrays)
+        save_npz(path, {"meta": np.array(json.dumps(meta)), **arrays})
         return path
 
     @staticmethod

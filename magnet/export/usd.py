@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from magnet.export.glb import (
     standing_vertices,
     unbroken,
 )
+from magnet.files import whole
 from magnet.motion.frames import canonical_frame, inverse
 from magnet.motion.rotations import to_quat
 from magnet.motion.scene import Scene
@@ -61,15 +64,30 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
     require_usd()
-    from pxr import Usd, UsdGeom, UsdSkel, UsdUtils
+    from pxr import Tf, UsdUtils
 
     slots = slots_to_write(scene, body)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     packed = path.suffix.lower() == ".usdz"
-    plain = path.with_name(f".{path.stem}.usdc") if packed else path
-    plain.unlink(missing_ok=True)
-    stage = Usd.Stage.CreateNew(str(plain))
+    with tempfile.TemporaryDirectory() as folder:  # usd-core does not always say that a disk is full; a copy does
+        plain = Path(folder) / (f"{path.stem}.usdc" if packed else path.name)
+        made = Path(folder) / "packed.usdz" if packed else plain
+        try:
+            _save_stage(scene, plain, body, bones, slots)
+            if packed:
+                UsdUtils.CreateNewUsdzPackage(str(plain), str(made))
+        except Tf.ErrorException as error:
+            said = str(error).strip().splitlines()[-1].strip()
+            raise OSError(f"{path}: usd-core could not write it: {said}") from error
+        with whole(path) as part:
+            shutil.copyfile(made, part)
+    return path
+
+
+def _save_stage(scene: Scene, path: Path, body: Body, bones: BoneOptions, slots: Sequence[int]) -> None:
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(scene.fps)
@@ -84,10 +102,6 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         _skeleton(stage, root, standing(body, betas), bones, place, turns)
         _skin(stage, root, standing_vertices(body, betas), body, slot)
     stage.GetRootLayer().Save()
-    if packed:
-        UsdUtils.CreateNewUsdzPackage(str(plain), str(path))
-        plain.unlink()
-    return path
 
 
 def _moved(scene: Scene, slot: int, bones: BoneOptions) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,7 @@ from magnet.export.drawing import (
     require_size,
 )
 from magnet.export.figures import add_ghosts, add_shadows
+from magnet.files import whole
 from magnet.motion.scene import FPS, Scene
 
 Report = Callable[[int, int], None]
@@ -89,15 +90,8 @@ def render_video(
         if not value > 0:
             raise ValueError(f"{name}: got {value:g}, expected more than 0")
     film = Film(scenes, context_frames, body, style, fps, size, title, ghosts, camera or Camera(), trail, speed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # A name of its own until it is whole, so that an interrupted run leaves no half picture behind.
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        with _reporting(progress, path.name) as report:
-            {".mp4": _write_mp4, ".gif": _write_gif, ".webp": _write_webp}[path.suffix.lower()](film, part, report)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole(path) as part, _reporting(progress, path.name) as report:
+        {".mp4": _write_mp4, ".gif": _write_gif, ".webp": _write_webp}[path.suffix.lower()](film, part, report)
     return path
 
 

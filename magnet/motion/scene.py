@@ -221,7 +221,6 @@ class Scene:
             ValueError: another suffix, whose format a `Scene` cannot write; says what can.
         """
         path = npz_path(path, "Motion.of(scene).save(path) or `magnet export` write other formats")
-        path.parent.mkdir(parents=True, exist_ok=True)
         meta = {"format": SCENE_FORMAT, "fps": self.fps, "body": self.body, "names": list(self.names)}
         arrays = {name: value.detach().cpu().numpy() for name, value in self.tensors().items()}
         save_npz(path, {"meta": np.array(json.dumps(meta)), **arrays})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,25 @@ def test_every_suffix_writes_what_it_says(suffix, duet: Scene, body: Body, tmp_p
     begins = {".npz": b"PK", ".bvh": b"HIERARCHY", ".glb": b"glTF", ".csv": b"scene,frame", ".gif": b"GIF89a",
               ".webp": b"RIFF", ".png": b"\x89PNG", ".usdc": b"PXR-USDC", ".usda": b"#usda"}  # fmt: skip
     assert all(path.read_bytes().startswith(begins.get(suffix, b"")) for path in written)
+
+
+@pytest.mark.parametrize("suffix", [s for s in formats.WRITTEN if s != ".fbx"])
+def test_what_was_there_stays_where_the_disk_is_full(
+    suffix: str, duet: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    for needs in ({".mp4": "av"} | dict.fromkeys(formats.USD, "pxr")).get(suffix, "").split():
+        pytest.importorskip(needs)
+    formats.write(duet.slice(0, 2), tmp_path / f"a{suffix}", body, style="skeleton")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr("secrets.token_hex", lambda _: "new")
+    for stem in [Path(name).stem for name in before]:
+        (tmp_path / f".{stem}.new.part{suffix}").symlink_to("/dev/full")
+    with pytest.raises(OSError) as caught:
+        formats.write(duet.slice(0, 3), tmp_path / f"a{suffix}", body, style="skeleton")
+    assert caught.value.errno == errno.ENOSPC
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if not path.is_symlink()} == before
 
 
 @pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb", ".HTML", ".CSV"])

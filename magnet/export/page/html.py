@@ -22,6 +22,7 @@ from magnet.export.page.marks import marked
 from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes
+from magnet.files import write_text
 from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
@@ -62,10 +63,7 @@ def save_html(
     if path.suffix.lower() not in ("", ".html"):
         raise ValueError(f"{path}: a page is a .html file")
     path = path if path.suffix else path.with_suffix(".html")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = page(scene, body, context=context, truth=truth, title=title, styles=styles)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_text(path, page(scene, body, context=context, truth=truth, title=title, styles=styles))
 
 
 def page(
