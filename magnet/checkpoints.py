@@ -214,7 +214,8 @@ def save(checkpoint: dict[str, Any], path: Path) -> None:
         CannotWrite: the disk is full; the checkpoint that was there before is whole.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside, advice = checksum_file(path), "choose another --out; then go on with --ckpt_path last"
+    goes_on = "go on with --ckpt_path last" if (path.parent / "last.ckpt").exists() else "run the same command again"
+    beside, advice = checksum_file(path), f"choose another --out; then {goes_on}"
     # Between the two files' renames a checkpoint has no checksum, never another one's.
     _, digest = write_whole(
         path.parent,

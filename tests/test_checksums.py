@@ -179,3 +179,14 @@ def test_a_config_without_its_own_hash_still_loads(tmp_path: Path, checkpoint: d
     (folder / "config.json").write_text(json.dumps(config | {"parts": [{"file": "../a.safetensors", "sha256": ""}]}))
     with pytest.raises(ValueError, match="its index names"):
         checkpoints.read(folder)
+
+
+def test_a_full_disk_before_the_first_checkpoint_does_not_send_to_one(
+    checkpoint: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(OSError, match="the disk is full .*then run the same command again$"):
+        IO.save_checkpoint(checkpoint, tmp_path / "checkpoints" / "last.ckpt")
