@@ -188,5 +188,5 @@ def test_a_full_disk_before_the_first_checkpoint_does_not_send_to_one(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(files.os, "fsync", full)
-    with pytest.raises(OSError, match="the disk is full .*then run the same command again$"):
+    with pytest.raises(OSError, match=r"the disk is full .*then run the same command again$"):
         IO.save_checkpoint(checkpoint, tmp_path / "checkpoints" / "last.ckpt")

@@ -19,9 +19,10 @@ from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
 from magnet.datamodules.registry import register_reader
-from magnet.export.bvh_read import Bvh, read_bvh
+from magnet.export.bvh_read import read_bvh
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood_together
+from magnet.export.rig_motion import RigMotion
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene
@@ -37,7 +38,7 @@ SHOWN = 12
 class BvhTrack:
     """One person's file: a skeleton with its motion, and the options it is read with."""
 
-    file: Bvh
+    file: RigMotion
     unit: str | None
     joints: dict[str, str]
     worst: float

@@ -6,10 +6,12 @@ from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import load_smplx, save_smplx
 from magnet.export.picture import contact_sheet
-from magnet.export.retarget import load_bvh
+from magnet.export.retarget import load_rigs
 from magnet.export.video import render_video
 from magnet.motion.resample import resampled
 from magnet.motion.tracked import LiveFrames, bridged
+
+load_bvh = load_rigs  # its name while it read nothing else
 
 __all__ = [
     "Camera",
@@ -17,6 +19,7 @@ __all__ = [
     "bridged",
     "contact_sheet",
     "load_bvh",
+    "load_rigs",
     "load_smplx",
     "render_video",
     "resampled",

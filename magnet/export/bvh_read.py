@@ -3,57 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnet.export.cutting import kept_frames
+from magnet.export.rig_motion import RATES, Bools, Floats, RigMotion, rest_of, usual_rate
 from magnet.motion.bvh import AXES, BvhHeader, BvhJoint, bvh_header
 from magnet.motion.runs import filled
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
-RATES = (23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 119.88, 120.0, 240.0)
-"""Rates that a rounded Frame Time such as 0.033333 stands for."""
-
-
-@dataclass(frozen=True)
-class Bvh:
-    """One skeleton of K joints, parents first, and T frames; lengths in the file's unknown unit."""
-
-    names: tuple[str, ...]
-    parents: tuple[int, ...]  # the root's is -1
-    offsets: Floats  # (K, 3) from the parent, in the rest pose
-    place: Floats  # (T, K, 3) from the parent in each frame; differs from `offsets` only where a joint slides
-    local: Floats  # (T, K, 3, 3) rotation relative to the parent; all are the identity in the rest pose
-    fps: float
-    path: Path
-    tracked: Bools | None = None  # (T,) frames that hold no NaN, which `gaps` allows; the others are as the one before
-
-    @property
-    def frames(self) -> int:
-        return len(self.local)
-
-    def rest(self) -> Floats:
-        """Joints in the rest pose, the root at the origin. (K, 3)"""
-        return _rest(self.offsets, self.parents)
-
-    def world(self) -> tuple[Floats, Floats]:
-        """Rotations from the rest pose (T, K, 3, 3) and positions (T, K, 3) in the file's world."""
-        turned, at = np.empty_like(self.local), np.empty_like(self.place)
-        for k, parent in enumerate(self.parents):
-            if parent < 0:
-                turned[:, k], at[:, k] = self.local[:, k], self.place[:, k]
-            else:
-                turned[:, k] = turned[:, parent] @ self.local[:, k]
-                at[:, k] = at[:, parent] + (turned[:, parent] @ self.place[:, k, :, None])[..., 0]
-        return turned, at
-
-
-def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | None = None) -> Bvh:
+def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | None = None) -> RigMotion:
     """Read one BVH file.
 
     Position channels of a joint replace its OFFSET, as most programs write them, and are added to it where they
@@ -61,7 +21,7 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
 
     Args:
         path: the file.
-        gaps: frames may hold NaN or infinity, where tracking was lost: they become `Bvh.tracked`.
+        gaps: frames may hold NaN or infinity, where tracking was lost: they become `RigMotion.tracked`.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
 
     Raises:
@@ -86,7 +46,7 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
     T, K = len(values), len(joints)
     place = np.broadcast_to(offsets, (T, K, 3)).copy()
     local = np.broadcast_to(np.eye(3), (T, K, 3, 3)).copy()
-    reach = float(np.linalg.norm(_rest(offsets, parents), axis=-1).max())
+    reach = float(np.linalg.norm(rest_of(offsets, parents), axis=-1).max())
     column = 0
     for k, joint in enumerate(joints):
         moved = {}
@@ -102,14 +62,9 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
     names = tuple(joint.name for joint in joints)
     fps = _rate(header.seconds, header.digits)
     # Cut last: where the root is counted from is told by the whole file.
-    return Bvh(names, parents, offsets, place[kept], local[kept], fps, path, None if tracked is None else tracked[kept])
-
-
-def _rest(offsets: Floats, parents: Sequence[int]) -> Floats:
-    rest = np.zeros_like(offsets)
-    for k, parent in enumerate(parents):
-        rest[k] = 0.0 if parent < 0 else rest[parent] + offsets[k]
-    return rest
+    return RigMotion(
+        names, parents, offsets, place[kept], local[kept], fps, path, None if tracked is None else tracked[kept]
+    )
 
 
 def _placed(offset: Floats, moved: dict[int, Floats], frames: int, reach: float) -> Floats:
@@ -196,7 +151,4 @@ def _rate(seconds: float, digits: int) -> float:
     rounded = rounded or [rate for rate in near if 10**digits // rate == round(seconds * 10**digits)]  # cut
     if rounded:
         return min(rounded, key=lambda rate: (rate != round(rate), abs(rate - fps)))
-    nearest = min(RATES, key=lambda rate: abs(rate - fps))
-    if abs(nearest - fps) < 5e-4 * fps:
-        return nearest
-    return float(round(fps)) if abs(round(fps) - fps) < 1e-3 * fps else fps
+    return usual_rate(fps)

@@ -1,4 +1,4 @@
-"""Scenes as FBX: Blender converts a GLB, because no maintained free library writes skins and motion."""
+"""FBX to and from GLB by Blender, because no maintained free library reads and writes its skins and motion."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from magnet.export.glb import save_glb
 from magnet.files import whole
 from magnet.motion.scene import Scene
 
-SCRIPT = Path(__file__).with_name("as_fbx.py")
+AS_FBX, AS_GLB = (Path(__file__).with_name(name) for name in ("as_fbx.py", "as_glb.py"))
 VARIABLE = "MAGNET_BLENDER"
 NEEDS = (
-    ".fbx is written by Blender, which is not here: pip install bpy, or put the program blender on the path, or set "
-    f"{VARIABLE} to a Python that has bpy; .glb needs nothing"
+    ".fbx is read and written by Blender, which is not here: pip install bpy, or put the program blender on the path, "
+    f"or set {VARIABLE} to a Python that has bpy; .glb needs nothing"
 )
 
 
@@ -49,15 +49,33 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ImportError: Blender is not here; says how to get it.
         ValueError: what `save_glb` refuses, or Blender's own words where it fails.
     """
-    command = blender()
+    blender()
     path = Path(path) if Path(path).suffix.lower() == ".fbx" else Path(path).with_suffix(".fbx")
     with tempfile.TemporaryDirectory() as folder:
         glb, made = save_glb(scene, Path(folder) / "scene.glb", body, bones), Path(folder) / "scene.fbx"
-        words = [*command, str(SCRIPT), "--", str(glb), str(made), f"{scene.fps:g}"]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        if done.returncode or not made.exists():
-            said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
-            raise ValueError(f"{path}: Blender ({command[0]}) could not write it: {said}")
+        _run(AS_FBX, glb, made, f"write {path}", f"{scene.fps:g}")
         with whole(path) as part:
             shutil.copyfile(made, part)
     return path
+
+
+def converted(fbx: Path, glb: Path) -> Path:
+    """A GLB of an FBX's skeletons and their motion, a keyframe for every frame. Returns its path.
+
+    Raises:
+        ImportError: Blender is not here; says how to get it.
+        ValueError: Blender's own words where it fails.
+    """
+    _run(AS_GLB, fbx, glb, f"read {fbx}")
+    return glb
+
+
+def _run(script: Path, source: Path, made: Path, task: str, *words: str) -> None:
+    """Let Blender run a script that makes one file of another. task: what is to be done, for the error"""
+    command = blender()
+    words = (*command, str(script), "--", str(source.resolve()), str(made), *words)
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode or not made.exists():
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
+        verb, _, path = task.partition(" ")
+        raise ValueError(f"{path}: Blender ({command[0]}) could not {verb} it: {said}")

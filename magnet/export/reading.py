@@ -11,13 +11,14 @@ from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_flag, require_number, require_whole
 from magnet.export.formats import MOST_FPS, WRITTEN
 from magnet.export.npz_files import is_ours, read_people
-from magnet.export.retarget import load_bvh, together
+from magnet.export.retarget import load_rigs, together
+from magnet.export.rig_files import RIGS
 from magnet.export.upright import WARNING
 from magnet.files import regular
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 
-READ = (".npz", ".bvh")
+READ = (".npz", *RIGS)
 """Suffixes that can be read."""
 UNSEEN = 0.0005
 """Metres by which people are moved without a word."""
@@ -39,9 +40,9 @@ class Reading:
     Args:
         fps: resample to this rate; None: as recorded.
         trim: cut people of different lengths to the shortest.
-        unit: of lengths; None: of a BVH by the length of its legs, of an npz metres.
+        unit: of lengths; None: of an npz metres, else by the length of legs.
         up: axis of the file that points up; None: found.
-        joints: for BVH: our joint's name to the file's, if no naming scheme fits.
+        joints: for BVH, GLB and FBX: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
         in_fps: frames a second of npz files that do not say it.
         start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
@@ -76,7 +77,7 @@ class Reading:
 def read(
     paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
 ) -> Read:
-    """Read a scene from a Scene npz, SMPL-X npz files or BVH files; several files are several people.
+    """Read a scene from a Scene npz, or from SMPL-X npz, BVH, GLB or FBX files; several files are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
@@ -88,28 +89,29 @@ def read(
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     options = options or Reading()
     suffixes = {file.suffix.lower() for file in files}
-    if len(suffixes) != 1 or not suffixes <= set(READ):
+    if not suffixes or not (suffixes == {".npz"} or suffixes <= set(RIGS)):
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
         also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
-        raise ValueError(f"cannot read {names}: expected .npz or .bvh files, all of one kind{only}")
+        raise ValueError(f"cannot read {names}: expected .npz files, or of skeletons ({', '.join(RIGS)}){only}")
     for file in files:
         if not file.exists():
             raise FileNotFoundError(f"{file}: no such file")
         regular(file)
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
-    if suffixes == {".bvh"}:
+    if suffixes <= set(RIGS):
         if options.in_fps is not None:
-            raise ValueError("in_fps: is for .npz files that say no frame rate; a .bvh says its own, --fps resamples")
-        bvh = {name: value for name, value in vars(options).items() if name != "in_fps"}
-        imported = load_bvh(files, body, **bvh)
+            said = f"a {min(suffixes)} says its own, --fps resamples"
+            raise ValueError(f"in_fps: is for .npz files that say no frame rate; {said}")
+        told = {name: value for name, value in vars(options).items() if name != "in_fps"}
+        imported = load_rigs(files, body, **told)
         notes = [str(source) for source in imported.sources]
         if abs(imported.floor) >= UNSEEN:
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
             notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
     if options.joints:
-        raise ValueError(f"{files[0]}: joint: is for .bvh files; in an .npz joints are where SMPL-X has them")
+        raise ValueError(f"{files[0]}: joint: is for {', '.join(RIGS)}; in an .npz joints are where SMPL-X has them")
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = [note for one in people for note in one.notes]
@@ -136,7 +138,7 @@ def shared(options: Reading, *groups: Sequence[str | Path]) -> list[Reading]:
 
 def _suits(file: Path) -> set[str]:
     """The options that only some kinds of file take, and this one does."""
-    if file.suffix.lower() == ".bvh":
+    if file.suffix.lower() in RIGS:
         return {"unit", "up", "joints"}
     return set() if is_ours(file) else {"unit", "up", "in_fps"}
 

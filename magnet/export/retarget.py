@@ -1,4 +1,4 @@
-"""Retargeting of BVH files to a body: any skeleton with known joint names, in any unit, up axis and rest pose."""
+"""Retargeting of recorded skeletons to a body: of known joint names, in any unit, up axis and rest pose."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from magnet.body.joints import (  # isort: skip
 )  # fmt: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bvh import offsets_of
-from magnet.export.bvh_read import read_bvh
 from magnet.export.cutting import require_one_clock
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood_together
+from magnet.export.rig_files import read_rigs
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resampled
 from magnet.motion.scene import BODY_JOINTS, Scene, cat_agents
@@ -50,6 +50,7 @@ class Source:
     """How one file was read."""
 
     path: Path
+    label: str  # the file's name, and who of several people in it
     scheme: str
     joints: dict[str, str]  # our joint's name: theirs
     unused: tuple[str, ...]  # their joints that nothing was taken from
@@ -67,7 +68,7 @@ class Source:
 
     def __str__(self) -> str:
         how = "the body's own skeleton" if self.exact else f"names of {self.scheme}; {len(self.joints)} joints mapped"
-        lines = [f"{self.path.name}: {how}; unit {self.unit}, {self.up} up"]
+        lines = [f"{self.label}: {how}; unit {self.unit}, {self.up} up"]
         lines += [f"  {note}" for note in self.notes]
         if not self.exact:
             lines.append(f"  limbs lie {100 * self.residual:.1f} cm from the file's on average, most at {self.worst}")
@@ -94,14 +95,14 @@ def _jumps_said(jumps: Sequence[int]) -> str:
 
 @dataclass(frozen=True)
 class Imported:
-    """People read from BVH files as one scene (B = 1), and how each file was read."""
+    """People read from files as one scene (B = 1), and how each was read."""
 
     scene: Scene
     sources: tuple[Source, ...]
     floor: float  # metres that everybody was lowered by, so that resting feet stand on y = 0
 
 
-def load_bvh(
+def load_rigs(
     paths: str | Path | Sequence[str | Path],
     body: Body,
     *,
@@ -114,7 +115,7 @@ def load_bvh(
     start: int = 0,
     end: int | None = None,
 ) -> Imported:
-    """Read BVH files, one per person: our own files, or any skeleton with known joint names.
+    """Read BVH, GLB or FBX files, of one person or several: our own, or any skeleton with known joint names.
 
     A skeleton that is the body's own is restored exactly; any other is fitted: limbs to positions, all else to
     rotations relative to the file's rest pose, which may be a T or an A pose.
@@ -124,36 +125,40 @@ def load_bvh(
         trim: cut files of different lengths to the shortest.
         unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs, the same for all files
             if one suits them all.
-        up: `y`, `z`, `-y` ...; None: found from where torsos point, and rest poses where somebody lies.
+        up: `y`, `z`, `-y` ...; None: y of GLB and FBX, as their formats say, else found from where torsos point, and
+            rest poses where somebody lies.
         joints: our joint's name to theirs, for names that no scheme knows.
         keep_floor: keep fitted people at the height they were recorded at.
         start, end: the frames of each file that are read, at its own rate, from 0 and without `end`; None: to the last.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not a BVH file, unknown names, units or up axis, rates or lengths that differ, no fit, no such
+        ImportError: an FBX, and no Blender.
+        ValueError: not such a file, unknown names, units or up axis, rates or lengths that differ, no fit, no such
             frames.
     """
     each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not each:
-        raise ValueError("no BVH files given")
+        raise ValueError("no files given")
     if up is not None and up not in UP:
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    files = [read_bvh(path, start=start, end=end) for path in each]
-    require_one_clock(each, [file.fps for file in files], start, end)
+    files = [rig for path in each for rig in read_rigs(path, start, end)]
+    require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
     if len(rates) > 1 and fps is None:
         found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
         raise ValueError(
             f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
         )
+    prescribed = {file.up for file in files}  # where all are of formats that say it
+    up = up or (prescribed.pop() if len(prescribed) == 1 else None)
     skeletons = understood_together(files, unit, up, joints)
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
     sources = tuple(replace(how, jumps=found) for (_, how), found in zip(read, jumps, strict=True))
-    labels = [str(path) for path in each]
+    labels = [f"{file.path} {file.person}".rstrip() for file in files]
     scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
     floor = 0.0
     if not keep_floor and not all(source.exact for _, source in read):
@@ -239,6 +244,7 @@ def _source(
     taken = {*used.values(), *skeleton.chain}
     return Source(
         path=skeleton.file.path,
+        label=skeleton.file.label,
         scheme=skeleton.naming.scheme,
         joints={JOINT_NAMES[j]: names[k] for j, k in sorted(used.items())},
         unused=tuple(name for k, name in enumerate(names) if k not in taken),
@@ -247,7 +253,7 @@ def _source(
         exact=exact,
         residual=float(residual.mean()),
         worst=JOINT_NAMES[joints[int(residual.argmax())]],
-        notes=skeleton.notes,
+        notes=(*skeleton.file.notes, *skeleton.notes),
     )
 
 

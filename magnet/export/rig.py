@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.body.joints import HIPS, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS
-from magnet.export.bvh_read import Bvh
 from magnet.export.naming import Naming, recognised
+from magnet.export.rig_motion import RigMotion
 from magnet.export.upright import WARNING, Stance, agreed, said, stance, told_against
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ LIMBS = ((L_HIP, L_KNEE), (L_KNEE, L_ANKLE), (L_ANKLE, L_FOOT), (L_SHOULDER, L_E
 class Skeleton:
     """A file with its world turned to y up and its lengths in metres."""
 
-    file: Bvh
+    file: RigMotion
     naming: Naming
     unit: str
     up: str
@@ -51,13 +51,13 @@ class Skeleton:
     notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
 
 
-def understood(file: Bvh, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
+def understood(file: RigMotion, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
     """As `understood_together`, one file."""
     return understood_together([file], unit, up, given)[0]
 
 
 def understood_together(
-    files: Sequence[Bvh], unit: str | None, up: str | None, given: Mapping[str, str] | None
+    files: Sequence[RigMotion], unit: str | None, up: str | None, given: Mapping[str, str] | None
 ) -> list[Skeleton]:
     """Skeletons of one scene in metres, y up, with our joints; options that are None are found from the files.
 
@@ -84,7 +84,7 @@ def understood_together(
     return found
 
 
-def _named(file: Bvh, given: Mapping[str, str] | None) -> Naming:
+def _named(file: RigMotion, given: Mapping[str, str] | None) -> Naming:
     naming = recognised(file.names, given)
     if naming.missing:
         raise ValueError(
@@ -100,7 +100,7 @@ def _leg(rest: Floats, ours: Mapping[int, int]) -> float:
     return float(np.linalg.norm(bones, axis=-1).sum()) / 2
 
 
-def _units(files: Sequence[Bvh], legs: Sequence[float]) -> list[str]:
+def _units(files: Sequence[RigMotion], legs: Sequence[float]) -> list[str]:
     """One unit for all, which fits most legs and makes the others a child's or a giant's; else each file's own."""
 
     def fits(leg: float, unit: str, low: float = SHORTEST_LEG, high: float = LONGEST_LEG) -> bool:
@@ -140,7 +140,7 @@ def _against_unit(legs: Sequence[float], unit: str) -> list[str]:
     return [f"{WARNING}unit {unit}, as said, makes legs {legs[0] * UNITS[unit]:.2g} m long{looks}"]
 
 
-def _stance(file: Bvh, naming: Naming, leg: float, at: Floats) -> Stance:
+def _stance(file: RigMotion, naming: Naming, leg: float, at: Floats) -> Stance:
     ours, rest = naming.joints, file.rest()
     ankles = (rest[ours[L_ANKLE]] + rest[ours[L_ANKLE + 1]]) / 2
     known = at[:, sorted(ours.values())] / max(leg, 1e-9)
@@ -154,7 +154,7 @@ def _stance(file: Bvh, naming: Naming, leg: float, at: Floats) -> Stance:
 
 
 def _skeleton(
-    file: Bvh, naming: Naming, unit: str, up: str, turned: Floats, at: Floats, notes: tuple[str, ...]
+    file: RigMotion, naming: Naming, unit: str, up: str, turned: Floats, at: Floats, notes: tuple[str, ...]
 ) -> Skeleton:
     ours, M = naming.joints, UP[up]
     pelvis = _ancestor(file.parents, [ours[1], ours[2]])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
-from magnet.export import load_bvh, save_bvh
+from magnet.export import load_rigs, save_bvh
 from magnet.export.bones import Names, bone_names
 from magnet.export.bvh import euler_zxy
 from magnet.export.bvh_read import read_bvh
@@ -31,7 +31,7 @@ def trio() -> Scene:
 def test_joints_and_skin_return_within_a_hundredth_of_a_millimetre(unit, trio: Scene, body: Body, tmp_path: Path):
     paths = save_bvh(trio, tmp_path / "trio.bvh", body, unit=unit)
     assert [path.name for path in paths] == ["trio_0.bvh", "trio_1.bvh", "trio_2.bvh"]
-    back = load_bvh(paths, body)
+    back = load_rigs(paths, body)
     assert all(source.exact and source.unit == unit and source.up == "y" for source in back.sources)
     assert (back.scene.fps, back.scene.body, back.floor) == (30.0, trio.body, 0.0)
     assert (body.joints(back.scene) - body.joints(trio)).abs().max() < 1e-5
@@ -56,7 +56,7 @@ def test_only_people_present_are_written_and_one_keeps_the_plain_name(trio: Scen
     gone = trio.replace(present=torch.tensor([[False, True, False]]))
     (path,) = save_bvh(gone, tmp_path / "solo", body)
     assert path.name == "solo.bvh"
-    back = load_bvh(path, body).scene
+    back = load_rigs(path, body).scene
     assert (body.joints(back)[:, :, 0] - body.joints(trio)[:, :, 1]).abs().max() < 1e-5
 
 
@@ -198,7 +198,7 @@ def test_a_skeleton_of_other_names_comes_back_as_any_rig_does(names: Names, trio
     """Written for programs that retarget by these; a rig of theirs may look just so, so it is fitted."""
     paths = save_bvh(trio, tmp_path / "trio.bvh", body, names=names)
     assert sorted(read_bvh(paths[0]).names) == sorted(bone_names(names))
-    found = load_bvh(paths, body, keep_floor=True)
+    found = load_rigs(paths, body, keep_floor=True)
     assert not any(source.exact for source in found.sources)
     assert (body.joints(found.scene) - body.joints(trio)).norm(dim=-1).mean() < 0.02
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import magnet
 from magnet import checkpoints
 from magnet.body import Body, on_floor
-from magnet.export import formats, load_bvh, reading, save_smplx
+from magnet.export import formats, load_rigs, reading, save_smplx
 from magnet.export.rig import UP
 from magnet.motion.scene import Scene
 
@@ -77,8 +77,8 @@ def test_what_cannot_be_read_is_named(duet: Scene, body: Body, tmp_path: Path):
         reading.read(tmp_path / "a.npz")
     with pytest.raises(FileNotFoundError, match=r"b\.npz: no such file"):
         reading.read(tmp_path / "b.npz")
-    for paths in ([], ["a.glb"], ["a.npz", "b.bvh"]):
-        with pytest.raises(ValueError, match=r"expected \.npz or \.bvh files, all of one kind"):
+    for paths in ([], ["a.usdz"], ["a.npz", "b.bvh"], ["a.glb", "b.npz"]):
+        with pytest.raises(ValueError, match=r"expected \.npz files, or of skeletons"):
             reading.read(paths)
     formats.write(duet.repeat(2), tmp_path / "two.npz", body)
     with pytest.raises(ValueError, match="holds 2 scenes; several files are several people"):
@@ -168,8 +168,8 @@ def test_a_bvh_that_is_moved_onto_the_floor_says_so_and_names_what_leaves_it(
 ) -> None:
     path = formats.write(duet, tmp_path / "a.bvh", body)[0]
     for metres, said in ((0.0004, None), (0.1, "lowered by 10.0 cm"), (-0.1, "raised by 10.0 cm")):
-        found = replace(load_bvh(path, body), floor=metres)
-        monkeypatch.setattr(reading, "load_bvh", lambda *_, found=found, **__: found)
+        found = replace(load_rigs(path, body), floor=metres)
+        monkeypatch.setattr(reading, "load_rigs", lambda *_, found=found, **__: found)
         notes = [note for note in reading.read(path).notes if "onto the floor" in note]
         assert notes == ([f"everybody was {said} onto the floor; --keep_floor leaves them"] if said else [])
 
@@ -211,9 +211,9 @@ def test_whoever_really_lies_is_read_with_the_axis_that_is_said(tmp_path: Path) 
     assert torch.allclose(read.T_world_root, lies.T_world_root, atol=1e-4) and not reading.warned(read.notes)
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".csv", ".usdc", ".usd", ".html"])
+@pytest.mark.parametrize("suffix", [".csv", ".usdc", ".usd", ".html"])
 def test_what_is_only_written_is_said_to_be_so(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"expected .npz or .bvh files, all of one kind; {suffix} can be written but"):
+    with pytest.raises(ValueError, match=rf"\(.bvh, .glb, .fbx\); {suffix} can be written but"):
         reading.read(tmp_path / f"a{suffix}")
 
 

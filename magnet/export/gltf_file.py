@@ -1,0 +1,176 @@
+"""The parts of a binary glTF 2.0 file that say how nodes move: numbers, the tree of nodes, their places in time."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from magnet.export.rig_motion import Floats
+from magnet.files import regular
+from magnet.motion.resample import slerp_quat
+from magnet.motion.rotations import from_quat, to_quat
+
+KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+"""Extensions in which keyframes themselves are compressed."""
+DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+
+
+class GltfFile:
+    """A .glb file that is read: its document, and what is computed from it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: no GLB, cut short, or of an extension that is not read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        data = regular(path).read_bytes()
+        try:
+            magic, version, length = struct.unpack_from("<4sII", data)
+            size, kind = struct.unpack_from("<I4s", data, 12)
+            if magic != b"glTF" or version != 2 or kind != b"JSON":
+                raise ValueError("it does not begin as glTF 2.0 does")
+            if length > len(data):
+                raise ValueError(f"it says that it has {length} bytes, and has {len(data)}")
+            self.document: dict[str, Any] = json.loads(data[20 : 20 + size])
+            self.nodes: list[dict[str, Any]] = self.document.get("nodes", [])
+            begin = 20 + size
+            self.binary = b""
+            if len(data) > begin:
+                count, kind = struct.unpack_from("<I4s", data, begin)
+                self.binary = data[begin + 8 : begin + 8 + count] if kind == b"BIN\0" else b""
+        except (ValueError, struct.error, AttributeError) as error:
+            raise ValueError(f"{path}: not a whole .glb file ({error}): export it again") from error
+        if packed := set(self.document.get("extensionsRequired", [])) & set(PACKED):
+            raise ValueError(f"{path}: its motion is compressed ({min(packed)}): export it without compression")
+
+    def numbers(self, index: int) -> Floats:
+        """An accessor's numbers, whole ones that stand for fractions as such. -> (N, C)"""
+        accessor = self.document["accessors"][index]
+        if "sparse" in accessor:
+            raise ValueError("sparse numbers are not read")
+        kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        if "bufferView" not in accessor:
+            return np.zeros((accessor["count"], width))
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stride = view.get("byteStride") or width * kind.itemsize
+        data = self._buffer(view["buffer"])
+        try:
+            values = np.ndarray((accessor["count"], width), kind, data, begin, (stride, kind.itemsize))
+        except (ValueError, TypeError) as error:
+            raise IndexError(f"numbers {index} lie outside the file") from error
+        values = values.astype(np.float64)
+        if accessor.get("normalized"):
+            values = np.maximum(values / np.iinfo(kind).max, -1.0)
+        if not np.isfinite(values).all():
+            raise ValueError("it holds NaN or infinity")
+        return values
+
+    def _buffer(self, index: int) -> bytes:
+        said = self.document["buffers"][index].get("uri")
+        if said is None:
+            return self.binary
+        head, comma, content = said.partition(",")
+        if not (comma and head.startswith("data:") and head.endswith(";base64")):
+            raise ValueError(f"its numbers are in another file ({said:.40}); expected them in this one")
+        try:
+            return base64.b64decode(content, validate=True)
+        except binascii.Error as error:
+            raise ValueError(str(error)) from error
+
+    @cached_property
+    def parents(self) -> dict[int, int]:
+        """Each node's parent, of those that have one."""
+        parents = {child: k for k, node in enumerate(self.nodes) for child in node.get("children", [])}
+        if any(not 0 <= child < len(self.nodes) for child in parents):
+            raise ValueError("a node has a child that is not there")
+        return parents
+
+    def above(self, node: int) -> list[int]:
+        """A node's ancestors, the nearest first."""
+        line: list[int] = []
+        while (parent := self.parents.get(line[-1] if line else node)) is not None:
+            if parent in line or parent == node:
+                raise ValueError("its nodes hang in a circle")
+            line.append(parent)
+        return line
+
+    def below(self, node: int) -> list[int]:
+        """A node and all that hang on it, each behind its parent."""
+        found = [node]
+        for each in found:
+            found += self.nodes[each].get("children", [])
+            if len(found) > len(self.nodes):
+                raise ValueError("its nodes hang in a circle")
+        return found
+
+    def name(self, node: int) -> str:
+        return str(self.nodes[node].get("name") or f"node{node}")
+
+    def resting(self, node: int) -> dict[str, Floats]:
+        """A node's own translation (3,), rotation (4,) as x y z w, and scale (3,), where nothing moves it."""
+        said = self.nodes[node]
+        if "matrix" in said:
+            matrix = np.array(said["matrix"], dtype=np.float64).reshape(4, 4).T
+            scale = np.linalg.norm(matrix[:3, :3], axis=0)
+            quat = to_quat(torch.from_numpy(matrix[:3, :3] / np.maximum(scale, 1e-12))).numpy()
+            return {"translation": matrix[:3, 3], "rotation": quat, "scale": scale}
+        return {what: np.array(said.get(what, usual), dtype=np.float64) for what, usual in DEFAULTS.items()}
+
+
+def matrices(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
+    """Transforms of nodes. (T or 1, 3), (T or 1, 4), (T or 1, 3) -> (T or 1, 4, 4)"""
+    frames = max(len(translation), len(rotation), len(scale))
+    length = np.maximum(np.linalg.norm(rotation, axis=-1, keepdims=True), 1e-12)
+    whole = np.zeros((frames, 4, 4))
+    whole[:, :3, :3] = from_quat(torch.from_numpy(rotation / length)).numpy() * scale[:, None]
+    whole[:, :3, 3], whole[:, 3, 3] = translation, 1.0
+    return whole
+
+
+def sampled(keys: Floats, values: Floats, how: str, at: Floats, turns: bool) -> Floats:
+    """A track's values at other times, as glTF interpolates.
+
+    Args:
+        keys: (N,) seconds, which grow.
+        values: (N, C), or (3 N, C) for `CUBICSPLINE`: incoming slope, value and outgoing slope of each key.
+        how: `LINEAR`, `STEP` or `CUBICSPLINE`.
+        at: (T,) seconds.
+        turns: they are quaternions.
+    """
+    spline = how == "CUBICSPLINE"
+    if len(values) != len(keys) * (3 if spline else 1) or not len(keys) or (np.diff(keys) <= 0).any():
+        raise ValueError("a track's keys and values do not go together")
+    own = values[1::3] if spline else values
+    if len(keys) == 1:
+        return np.repeat(own, len(at), axis=0)
+    after = np.searchsorted(keys, at, side="right").clip(1, len(keys) - 1)
+    before = after - 1
+    span = (keys[after] - keys[before])[:, None]
+    share = ((at - keys[before])[:, None] / span).clip(0.0, 1.0)
+    if how == "STEP":  # times are rounded: a frame at a key must not miss it
+        return np.where(share < 0.99, own[before], own[after])
+    if spline:
+        s, square, cube = share, share**2, share**3
+        return (
+            (2 * cube - 3 * square + 1) * own[before]
+            + span * (cube - 2 * square + s) * values[2::3][before]
+            + (3 * square - 2 * cube) * own[after]
+            + span * (cube - square) * values[0::3][after]
+        )
+    if not turns:
+        return own[before] + share * (own[after] - own[before])
+    unit = torch.from_numpy(own / np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-12))
+    return slerp_quat(unit[before], unit[after], torch.from_numpy(share[:, 0])).numpy()
