@@ -32,8 +32,23 @@ class Registered:
     origin: str
 
 
+@dataclass(frozen=True)
+class Failed:
+    """A plug-in that is not there.
+
+    Args:
+        name: of its entry point.
+        error: what it raised.
+        origin: the package that brings it and its version, or the entry point's value.
+    """
+
+    name: str
+    error: BaseException
+    origin: str
+
+
 class Registry:
-    """Classes of one sort by name. A plug-in that fails to load is kept in `failed` and hides no other.
+    """Classes of one sort by name. Plug-ins that fail to load are kept in `failed`, and hide no other.
 
     Args:
         what: the sort, for messages, such as "task".
@@ -45,8 +60,7 @@ class Registry:
     def __init__(self, what: str, group: str, modules: Sequence[str], check: Callable[[str, type], None]) -> None:
         self.what, self.group, self.modules, self.check = what, group, modules, check
         self.known: dict[str, Registered] = {}
-        self.failed: dict[str, BaseException] = {}
-        self.failed_of: dict[str, str] = {}  # where each of them comes from
+        self.failed: list[Failed] = []
         self.discovered = False
 
     def add(self, name: str, kind: type, origin: str) -> None:
@@ -68,7 +82,6 @@ class Registry:
             return False
         self.discovered = True
         self.failed.clear()
-        self.failed_of.clear()
         for module in self.modules:
             importlib.import_module(module)
         for point in entry_points(group=self.group):
@@ -78,9 +91,10 @@ class Registry:
                 VERSIONS[point.dist.name] = point.dist.version
             if names and point.name not in names:
                 self._warn(point.name, origin, f"names a class that is registered already: use {' or '.join(names)}")
-        for name, error in self.failed.items():
-            if (known := self.known.get(name)) is not None:  # which is what the name gives, without a word
-                self._warn(name, self.failed_of[name], f"is not used, {name} is of {known.origin}: {told(error)}")
+        for each in self.failed:
+            if (known := self.known.get(each.name)) is not None:  # which is what the name gives, without a word
+                why = f"is not used, {each.name} is of {known.origin}: {told(each.error)}"
+                self._warn(each.name, each.origin, why)
         return True
 
     def _warn(self, name: str, origin: str, what: str) -> None:
@@ -108,17 +122,19 @@ class Registry:
 
     def fail(self, name: str, error: BaseException, origin: str) -> None:
         """Note why a plug-in is not there, and which package brings it."""
-        self.failed[name], self.failed_of[name] = error, origin
+        self.failed.append(Failed(name, error, origin))
 
     def require_loaded(self, name: str) -> None:
         """Say why a plug-in is not there.
 
         Raises:
-            ValueError: a plug-in of that name, in letters of any case, failed to load.
+            ValueError: a plug-in of that name, in letters of any case, failed to load, or several did.
         """
-        for each, error in self.failed.items():
-            if each.lower() == name.lower():
-                raise ValueError(f"{self.what} {each} failed to load: {told(error)}") from error
+        found = [each for each in self.failed if each.name.lower() == name.lower()]
+        if found:
+            many = len(found) > 1
+            why = "; ".join(told(each.error) + (f" (of {each.origin})" if many else "") for each in found)
+            raise ValueError(f"{self.what} {found[0].name} failed to load: {why}") from found[0].error
 
 
 def attempted(call: Callable[[], object]) -> BaseException | None:

@@ -50,11 +50,21 @@ def test_one_that_fails_is_left_out_with_its_reason(
     registry, points = offered
     points += [Point("Bad", raising(error)), Point("good", lambda: int)]
     assert registry.discover()
-    assert set(registry.known) == {"good"} and registry.failed == {"Bad": error}
-    assert registry.failed_of == {"Bad": "of_Bad:Thing"}
+    assert set(registry.known) == {"good"} and registry.failed == [plugins.Failed("Bad", error, "of_Bad:Thing")]
     with pytest.raises(ValueError) as caught:
         registry.require_loaded("bad")
     assert str(caught.value) == f"thing Bad failed to load: {said}"
+
+
+def test_of_two_of_one_name_that_fail_each_is_told(offered: tuple[plugins.Registry, list[Point]]) -> None:
+    registry, points = offered
+    points += [Point("bad", raising(ImportError("no shoes"))), Point("bad", raising(OSError("no disk")))]
+    points[1].value = "others:Thing"
+    registry.discover()
+    with pytest.raises(ValueError) as caught:
+        registry.require_loaded("bad")
+    both = "ImportError: no shoes (of of_bad:Thing); OSError: no disk (of others:Thing)"
+    assert str(caught.value) == f"thing bad failed to load: {both}"
 
 
 def warnings_of(registry: plugins.Registry) -> list[str]:

@@ -55,9 +55,9 @@ def draw_list(console: Console, name: str | None) -> bool:
         show_reader(console, kind)
     for entry in registry.unprepared():
         show_data(console, entry)
-    for plugin, error in registry.failures().items():
-        console.print(f"[bold red]{plugin}[/]", soft_wrap=True)
-        show(console, "failed to load", told(error))
+    for lost in registry.failures():
+        console.print(f"[bold red]{lost.name}[/]", soft_wrap=True)
+        show(console, "failed to load", told(lost.error))
     return not registry.failures()
 
 

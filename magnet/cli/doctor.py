@@ -190,9 +190,8 @@ def others() -> Iterator[Finding]:
             if entry.origin != "magnet":
                 fault = fault_of(entry.kind) if known is tasks.TASKS else None
                 yield _other(f"{known.what} {name}", entry.origin, fault)
-        for name, error in sorted(known.failed.items()):
-            origin = known.failed_of.get(name, "another package")
-            yield _other(f"{known.what} {name}", origin, f"failed to load: {plugins.told(error)}")
+        for lost in sorted(known.failed, key=lambda each: (each.name, each.origin)):
+            yield _other(f"{known.what} {lost.name}", lost.origin, f"failed to load: {plugins.told(lost.error)}")
 
 
 def _other(what: str, origin: str, fault: str | None) -> Finding:

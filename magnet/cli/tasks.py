@@ -168,9 +168,9 @@ def draw_tasks(console: Console) -> bool:
         for line, style in lines:
             console.print(Padding(Text(line, style), (0, 0, 0, 4), expand=False))
         console.print()
-    for name, error in registry.failures().items():
-        console.print(Text.assemble((name, "bold red"), "  failed to load"))
-        console.print(Padding(Text(told(error), "red"), (0, 0, 1, 4), expand=False))
+    for lost in registry.failures():
+        console.print(Text.assemble((lost.name, "bold red"), "  failed to load"))
+        console.print(Padding(Text(told(lost.error), "red"), (0, 0, 1, 4), expand=False))
     console.print("magnet tasks show NAME      draw in what order a task removes noise", style="dim")
     console.print("magnet test --task NAME     sample it and measure; magnet predict --task NAME", style="dim")
     return not registry.failures() and not faults

@@ -13,7 +13,7 @@ from typing import TypeVar, get_args
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Family, Reader
-from magnet.plugins import Registered, Registry, attempted, look_here, told
+from magnet.plugins import Failed, Registered, Registry, attempted, look_here, told
 
 BUILT_IN = (
     "synthetic",
@@ -171,10 +171,10 @@ def default_path() -> str:
     return f"{data.__module__}.{data.__name__}"
 
 
-def failures() -> dict[str, BaseException]:
+def failures() -> list[Failed]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
-    return dict(DATA.failed)
+    return list(DATA.failed)
 
 
 def readers() -> dict[str, type[Reader]]:
@@ -201,7 +201,8 @@ def reader(name: str) -> type[Reader]:
     DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
-    failed = f" ({', '.join(DATA.failed)} failed to load: magnet data list says why)" if DATA.failed else ""
+    names = dict.fromkeys(each.name for each in DATA.failed)
+    failed = f" ({', '.join(names)} failed to load: magnet data list says why)" if names else ""
     raise ValueError(f"no data set {name!r}; {hint}{failed}")
 
 

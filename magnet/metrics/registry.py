@@ -75,9 +75,9 @@ def other_metrics(
         known = ours()
         TAKEN.update(known, columns_of(*known.values()), [MEMORISATION], NearestTraining.columns)
         METRICS.discover()
-        for name, error in METRICS.failed.items():
-            if name not in METRICS.known:  # else the registry has warned
-                _warn(name, METRICS.failed_of[name], "failed to load", error)
+        for lost in METRICS.failed:
+            if lost.name not in METRICS.known:  # else the registry has warned
+                _warn(lost.name, lost.origin, "failed to load", lost.error)
     made: dict[str, Metric] = {}
     for name, each in sorted(METRICS.known.items()):
         words: dict[str, Any] = {"of": of, "agents": agents, "fps": fps}

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import is_dataclass
 from typing import TypeVar
 
-from magnet.plugins import Registered, Registry, attempted, look_here
+from magnet.plugins import Failed, Registered, Registry, attempted, look_here
 
 VARIABLE = "MAGNET_TASKS"
 
@@ -121,7 +121,7 @@ def name_of(kind: type) -> str:
     return next((entry.name for entry in TASKS.known.values() if entry.kind is kind), kind.__name__)
 
 
-def failures() -> dict[str, BaseException]:
+def failures() -> list[Failed]:
     """Plug-ins that could not be loaded, with the error of each."""
     discover()
-    return dict(TASKS.failed)
+    return list(TASKS.failed)

@@ -108,7 +108,7 @@ def test_what_packages_add_is_listed_and_what_failed_has_its_reason(
     monkeypatch.setattr(plugins, "entry_points", lambda group: [each for each in points if each.group == group])
     for registry in (TASKS, DATA, METRICS):
         monkeypatch.setattr(registry, "known", dict(registry.known))
-        monkeypatch.setattr(registry, "failed", {})
+        monkeypatch.setattr(registry, "failed", [])
         monkeypatch.setattr(registry, "discovered", False)
     assert cli.main(["doctor"]) == 1
     said = capsys.readouterr().out

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from magnet import __version__, cli
-from magnet.plugins import Registered
+from magnet.plugins import Failed, Registered
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
 
@@ -44,7 +44,8 @@ def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
     registry.discover()
     entry = Registered("foreign", Foreign, "strange-tasks 3.1")
     monkeypatch.setitem(registry.TASKS.known, "foreign", entry)
-    monkeypatch.setitem(registry.TASKS.failed, "broken", ImportError("no module named [nowhere]"))
+    lost = Failed("broken", ImportError("no module named [nowhere]"), "strange-tasks 3.1")
+    monkeypatch.setattr(registry.TASKS, "failed", [lost])
 
 
 def no_grid(self) -> MaskSchedule:

@@ -27,7 +27,7 @@ class Foreign:
 def clean_registry(monkeypatch):
     registry.discover()
     monkeypatch.setattr(registry.TASKS, "known", dict(registry.TASKS.known))
-    monkeypatch.setattr(registry.TASKS, "failed", {})
+    monkeypatch.setattr(registry.TASKS, "failed", [])
 
 
 class FakePoint:
@@ -62,7 +62,8 @@ def test_a_plug_in_that_fails_is_listed_and_hides_no_other(clean_registry, monke
     monkeypatch.setattr(plugins, "entry_points", lambda group: points)
     registry.discover(again=True)
     assert registry.get("duel") is Foreign
-    assert "nope" in str(registry.failures()["broken"])
+    (lost,) = registry.failures()
+    assert lost.name == "broken" and "nope" in str(lost.error)
     with pytest.raises(ValueError, match="broken failed to load"):
         registry.get("broken")
 
@@ -105,7 +106,8 @@ def test_a_variable_may_name_a_module_whose_tasks_register_themselves(clean_regi
     monkeypatch.setenv(registry.VARIABLE, "stray_tasks,no_tasks,stray_task")
     registry.discover(again=True)
     assert {entry.name: entry.origin for entry in registry.entries()}["stray"] == "MAGNET_TASKS=stray_tasks"
-    assert all("registers no task" in str(registry.failures()[name]) for name in ("no_tasks", "stray_task"))
+    lost = {each.name: str(each.error) for each in registry.failures()}
+    assert all("registers no task" in lost[name] for name in ("no_tasks", "stray_task"))
 
 
 def test_a_variable_finds_a_module_in_the_working_directory(tmp_path):
