@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser
+from magnet.cli.predict_files import flat
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,7 +24,7 @@ FILE = "scenes.json"
 SAME = ("task", "benchmark", "context frames", "horizon frames")
 """Facts that are told where they differ."""
 OPTIONS = ("sampler", "task options")
-"""Options in results.json, as Python writes objects, whose single values are told where they differ."""
+"""Options in results.json whose single values are told where they differ."""
 
 EPILOG = """\
 A and B are folders with results of `magnet test` or `magnet score`, on the same test scenes. Compared are the first
@@ -145,8 +146,18 @@ def settings(results: Results, values: SceneValues, row: str) -> dict[str, Any]:
     found = {key: values.facts.get(key) for key in SAME}
     found["samples"] = said.get(row) if isinstance(said, dict) else said
     for key in OPTIONS:
-        found |= scalars(str(results.meta.get(key, "")))
+        found |= single(results.meta.get(key, ""))
     return found
+
+
+def single(options: Any) -> dict[str, Any]:
+    """Options one by one, those of options in options as `guidance.kind`.
+
+    Args:
+        options: a mapping; or text, as Python writes objects: of a task, and in results of earlier versions of a
+            sampler too.
+    """
+    return flat(options) if isinstance(options, dict) else scalars(str(options))
 
 
 def scalars(text: str) -> dict[str, Any]:

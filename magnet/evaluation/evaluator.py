@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, fields
+from dataclasses import asdict, astuple, fields
 from typing import Any
 
 import lightning as L
@@ -241,7 +241,7 @@ class Evaluator(L.LightningModule):
             "task options": repr(self.task),
             "samples": self.samples,
             "seed": self.seed,
-            "sampler": repr(self.sampler.filled(self.denoiser.sampling)),
+            "sampler": asdict(self.sampler.filled(self.denoiser.sampling)),
             "test scenes": scenes,
             "context frames": self.context,
             "horizon frames": self.horizon,

@@ -1,3 +1,4 @@
+import json
 import math
 from dataclasses import replace
 from typing import ClassVar
@@ -234,6 +235,8 @@ def test_prediction_counts_what_it_costs(answered):
     assert (evaluation.scenes, scenes.scenes, stats.runs) == (9, 27, 3)
     assert stats.means()["calls"] == stats.evaluations == FAST.steps + tokens - past - 1
     assert evaluation.facts()["sampling"]["evaluations"] == stats.evaluations
+    said = json.loads(json.dumps(evaluation.facts()["sampler"]))
+    assert (said["steps"], said["guidance"]["kind"]) == (FAST.steps, FAST.guidance.kind), "as a configuration has it"
 
 
 @pytest.mark.parametrize(
