@@ -221,11 +221,9 @@ class Model:
             ValueError: no such agent, nobody else in the scene, or a shape of the wrong size.
         """
         require_rate(scene)
-        targets = _slots("agent", agent)
+        targets = _slots("agent", agent, self.most_people, "the model takes agents")
         if not targets:
             raise ValueError("agent: got none; name who is to be filled in")
-        if max(targets) >= self.most_people:
-            raise ValueError(f"agent {max(targets)}: the model takes agents 0 to {self.most_people - 1}")
         scene = scene.pad_agents(max(*targets, scene.agents - 1) + 1)
         slots = list(targets)
         present, betas = scene.present.clone(), torch.where(scene.present[..., None], scene.betas, 0.0)
@@ -253,7 +251,8 @@ class Model:
         Args:
             block: token steps (of 4 frames) that are generated at a time; the others are seen up to their end.
         """
-        fields: dict[str, Any] = {"target": _slots("agent", agent), "block": block}
+        require_rate(scene)
+        fields: dict[str, Any] = {"target": _slots("agent", agent, scene.agents), "block": block}
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, **fields)
 
     def partner(
@@ -272,7 +271,7 @@ class Model:
             ValueError: as `magnet.generation.partner.Partner`.
         """
         plain, body = _with_its_body(past, "past")
-        how = (_slots("agents", agents), self.sampler, self._generator(seed), block)
+        how = (_slots("agents", agents, plain.agents, "past has people"), self.sampler, self._generator(seed), block)
         partner = LivePartner(self.denoiser, plain, *how)
         partner.model = body
         return partner
@@ -388,8 +387,14 @@ def _with_its_body(scene: Scene, label: str = "the scene") -> tuple[Scene, Body 
     return plain, body
 
 
-def _slots(name: str, agents: int | Sequence[int]) -> tuple[int, ...]:
-    """One slot or several as a task takes them."""
+def _slots(name: str, agents: int | Sequence[int], count: int, has: str = "the scene has people") -> tuple[int, ...]:
+    """One slot or several of so many, as a task takes them.
+
+    Raises:
+        ValueError: no whole numbers, or no such slot.
+    """
     several = (agents,) if isinstance(agents, int | np.integer) else agents
     require_wholes(name, several)
+    if strange := [agent for agent in several if not 0 <= agent < count]:
+        raise ValueError(f"{name} {strange[0]}: {has} 0 to {count - 1}")
     return tuple(int(agent) for agent in several)

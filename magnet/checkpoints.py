@@ -31,6 +31,9 @@ DEFAULT = "duet"
 PART_BYTES = 16_000_000
 FORMAT = 1
 
+OF_RUNS = ("last", "best", "latest")
+"""What the command calls checkpoints and folders of runs in its own folder; without that it says nothing."""
+
 HUB = "hub:"
 """Prefix of the name of a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
 HUB_FILES = ["config.json", "*.safetensors", "README.md"]
@@ -107,7 +110,10 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
     if path.exists() and str(name_or_path):
         return path
     there = ", ".join(names()) or "none"
-    raise ValueError(f"no checkpoint {name_or_path}: not a file, nor a model that comes with the package ({there})")
+    said = f"no checkpoint {name_or_path}: not a file, nor a model that comes with the package ({there})"
+    if str(name_or_path) in OF_RUNS:
+        said += "; give a run's folder, such as runs/NAME/latest, or a file in its checkpoints"
+    raise ValueError(said)
 
 
 def read(path: str | Path, halves: bool = False) -> dict[str, Any]:

@@ -337,7 +337,10 @@ CARELESS = {
     "frames: got 8.0, expected a whole number": lambda model, duet: model.predict(duet, frames=8.0),
     "agent: got 'a', expected whole numbers": lambda model, duet: model.inpaint(duet, "a"),
     "agent: got 0.5, expected whole numbers": lambda model, duet: model.react(duet, 0.5),
-    "target -1: the grid has agents 0 to 1": lambda model, duet: model.inpaint(duet, -1),
+    "agent -1: the model takes agents 0 to 2": lambda model, duet: model.inpaint(duet, -1),
+    "agent 2: the scene has people 0 to 1": lambda model, duet: model.react(duet, 2),
+    "agents 3: past has people 0 to 1": lambda model, duet: model.partner(duet, agents=3),
+    "agents (0, 0): name each agent once": lambda model, duet: model.partner(duet, agents=(0, 0)),
     "target: got 0, expected whole numbers": lambda model, duet: model.predict(duet, "motion_control", target=0),
     "task: got 5, expected a name: agentic": lambda model, duet: model.predict(duet, 5),
     "task motion_control has no field blok; it has target": lambda model, duet: model.predict(

@@ -92,7 +92,7 @@ def mask_unknown(scene: Scene, known: Tensor, first: int = 0, stop: int | None =
     if needed * TOKEN_FRAMES > scene.frames:
         raise ValueError(f"the task needs {needed * TOKEN_FRAMES} frames, the scene has {scene.frames}")
     stop = len(known) if stop is None else stop
-    part = scene.slice(first * TOKEN_FRAMES, min(stop, needed) * TOKEN_FRAMES)
+    part = scene.slice(first * TOKEN_FRAMES, max(min(stop, needed), first) * TOKEN_FRAMES)
     blank = empty_scene(scene.scenes, (stop - first) * TOKEN_FRAMES, scene.agents, scene.T_world_root)
     keep = known[first : min(stop, needed)].repeat_interleave(TOKEN_FRAMES, dim=0).to(scene.device)  # (T, P)
     keep = keep[:, :, None, None] & scene.present[:, None, :, None, None]

@@ -77,7 +77,8 @@ class Partner:
         if past.frames < TOKEN_FRAMES:
             raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")
         self.task = MotionControl(target=tuple(agents), block=block)
-        chosen(Grid(1, past.agents, 0), self.task.target)  # who answers, and somebody to be answered
+        # Who answers, and somebody to be answered.
+        chosen(Grid(1, past.agents, 0), self.task.target, "agents", "past has people")
         self._present, self._betas, self._body = past.present.cpu(), past.betas.cpu().float(), past.body
         self._given = torch.tensor([agent not in self.task.target for agent in range(past.agents)])
         self._followed = (self._present & self._given).numpy()

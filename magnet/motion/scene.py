@@ -133,8 +133,16 @@ class Scene:
         return self.replace(**floats) if floats else self
 
     def slice(self, start: int, stop: int | None = None) -> Scene:
-        """Frames `start:stop` of every scene."""
-        return self.frames_at(builtins.slice(start, stop))
+        """Frames `start:stop` of every scene; negative ones count from the scene's end, and there may be none.
+
+        Raises:
+            ValueError: the stop lies before the start.
+        """
+        part = builtins.slice(start, stop)
+        first, behind, _ = part.indices(self.frames)
+        if first > behind:
+            raise ValueError(f"slice({start}, {stop}) of {self.frames} frames: the stop lies before the start")
+        return self.frames_at(part)
 
     def select(self, scenes: Tensor | Sequence[int] | builtins.slice) -> Scene:
         """Some of the B scenes, in the order given."""

@@ -13,24 +13,30 @@ from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.registry import register_task
 
 
-def chosen(grid: Grid, target: tuple[int, ...]) -> Tensor:
+def chosen(grid: Grid, target: tuple[int, ...], name: str = "target", has: str = "the grid has agents") -> Tensor:
     """Which agents are generated. (P,) bool
+
+    Args:
+        grid: what they are part of.
+        target: their slots.
+        name: what these are called where they are given, for messages.
+        has: of whom there are so many, for messages.
 
     Raises:
         ValueError: no such agent, one named twice, or nobody is left to be given.
     """
-    require_wholes("target", target)
+    require_wholes(name, target)
     mask = torch.zeros(grid.agents, dtype=torch.bool)
     if len(set(target)) != len(target):
-        raise ValueError(f"target {target}: name each agent once")
+        raise ValueError(f"{name} {target}: name each agent once")
     for agent in target:
         if not 0 <= agent < grid.agents:
-            raise ValueError(f"target {agent}: the grid has agents 0 to {grid.agents - 1}")
+            raise ValueError(f"{name} {agent}: {has} 0 to {grid.agents - 1}")
         mask[agent] = True
     if not mask.any() or mask.all():
         more = "; of one person who is given, `magnet predict --people 2` adds another, in Python inpaint(agent=1)"
         more = more if grid.agents == 1 else ""
-        raise ValueError(f"target {target}: name some of the {grid.agents} agents, not none and not all{more}")
+        raise ValueError(f"{name} {target}: name some of the {grid.agents} agents, not none and not all{more}")
     return mask
 
 

@@ -151,7 +151,7 @@ def test_what_cannot_be_answered_is_named(model, duet):
         Partner(model, duet.slice(0, 2))
     with pytest.raises(ValueError, match="not none and not all"):
         Partner(model, duet.slice(0, 16), (0, 1), FAST)
-    with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 1"):
+    with pytest.raises(ValueError, match="agents 5: past has people 0 to 1"):
         Partner(model, duet.slice(0, 16), (5,), FAST)
     with pytest.raises(ValueError, match=r"multiple of 12: .* 3 are answered at a time"):
         Partner(model, duet.slice(0, 16), (0,), FAST, block=3).answer(duet.slice(16, 20))

@@ -152,6 +152,13 @@ def test_no_scenes_can_be_picked(scene: Scene):
         assert scene.select(nothing).scenes == 0
 
 
+def test_frames_whose_stop_lies_before_their_start_are_refused(scene: Scene):
+    for start, stop in ((5, 2), (-4, 0)):
+        with pytest.raises(ValueError, match=rf"slice\({start}, {stop}\) of 64 frames: the stop lies before the start"):
+            scene.slice(start, stop)
+    assert scene.slice(5, 5).frames == scene.slice(scene.frames).frames == 0
+
+
 def test_tensors_of_other_types_are_named(scene: Scene):
     with pytest.raises(ValueError, match=r"present: got torch\.float32, expected bool"):
         scene.replace(present=scene.present.float())

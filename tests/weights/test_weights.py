@@ -146,6 +146,12 @@ def test_an_unknown_name_says_which_there_are():
         checkpoints.resolve("no_such")
 
 
+@pytest.mark.parametrize("name", ["last", "best", "latest"])
+def test_what_the_command_calls_checkpoints_of_its_folder_is_told_how_to_be_named(name: str):
+    with pytest.raises(ValueError, match=rf"^no checkpoint {name}: .*; give a run's folder, such as runs/NAME/latest"):
+        checkpoints.resolve(name)
+
+
 def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoint):
     names = ("vqvae.encoder.a", "vqvae.decoder.b", "vqvae.pose.mean", "quantizer.codes", "quantizer.ema_count")
     old = {name: torch.randn(3) for name in names}
