@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def load(
     *,
     device: str | torch.device = "cpu",
     steps: int | None = None,
-    sampler: str | SamplerOptions = "default",
+    sampler: str | Mapping[str, Any] | SamplerOptions = "default",
 ) -> Model:
     """Load a trained model: a shipped one by name ("duet"), one of a hub ("hub:owner/name"), or a checkpoint's path.
 
@@ -52,8 +52,8 @@ def load(
         device: device to run on.
         steps: denoising steps; fewer are faster and coarser. None: the sampler's.
         sampler: preset of the sampler: `default`, the best for the model, `plain`, or another of
-            `magnet.sampling.presets`, such as `paper` for the paper's sampling; or options of your own, such as
-            `SamplerOptions(settle="hold")`.
+            `magnet.sampling.presets`, such as `paper` for the paper's sampling; or options of your own, as a mapping,
+            `{"settle": "hold"}`, or as `SamplerOptions(settle="hold")`.
 
     Raises:
         ValueError: no such model or sampler (the message says what there is), or no such device.
@@ -66,14 +66,7 @@ def load(
     """
     place = device_of(device)
     said: dict[str, Any] = {} if steps is None else {"steps": steps}
-    if isinstance(sampler, SamplerOptions):
-        options = dataclasses.replace(sampler, **said)
-    elif isinstance(sampler, str):
-        options = SamplerOptions.preset(sampler, **said)
-    else:
-        raise ValueError(
-            f"sampler: got {sampler!r}, expected a preset's name or SamplerOptions(steps=2) of magnet.sampling.options"
-        )
+    options = SamplerOptions.of(sampler, **said)
     return Model(DenoiserCore.load(name_or_path).to(place), options)
 
 
@@ -120,7 +113,7 @@ def read(
 
 @dataclass(frozen=True, repr=False)
 class Model:
-    """A trained model with its sampler.
+    """A trained model with its sampler, for which a mapping of its options will do.
 
     What samples whole scenes takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
     b * samples + s of the result, which includes the given frames. `cond` is the condition of each scene, for models
@@ -131,6 +124,8 @@ class Model:
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __post_init__(self) -> None:
+        if isinstance(self.sampler, Mapping):
+            object.__setattr__(self, "sampler", SamplerOptions.of(self.sampler))
         for name, kind in (("denoiser", DenoiserCore), ("sampler", SamplerOptions)):
             if not isinstance(getattr(self, name), kind):
                 got = type(getattr(self, name)).__name__

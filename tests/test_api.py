@@ -346,7 +346,8 @@ CARELESS = {
     "task motion_control has no field blok; it has target": lambda model, duet: model.predict(
         duet, "motion_control", blok=2
     ),
-    "sampler: got dict, expected SamplerOptions": lambda model, duet: Model(model.denoiser, {"steps": 3}),
+    "sampler: got list, expected SamplerOptions": lambda model, duet: Model(model.denoiser, [3]),
+    "sampler has no field setle; did you mean settle?": lambda model, duet: Model(model.denoiser, {"setle": "hold"}),
     "guidance: got 'history', expected a Guidance": lambda model, duet: SamplerOptions(guidance="history"),
     "device: got 'gpu', expected cpu": lambda model, duet: magnet.load(device="gpu"),
     "scene: got 5, expected 0 to 0": lambda model, duet: model.generate(frames=8).show(5),
@@ -366,6 +367,8 @@ CARELESS = {
 
 def test_options_of_ones_own_are_taken_by_load_as_a_preset_is():
     own = SamplerOptions(settle="hold", guidance=Guidance(cond_weight=2.0))
+    fields = {"settle": "hold", "guidance": {"cond_weight": 2.0}}
+    assert magnet.load("duet", sampler=fields).sampler == Model(magnet.load("duet").denoiser, fields).sampler == own
     assert magnet.load("duet", sampler=own).sampler == own
     assert magnet.load("duet", sampler=own, steps=4).sampler == dataclasses.replace(own, steps=4)
 
@@ -392,8 +395,6 @@ def test_scenes_and_models_say_in_one_line_what_they_are() -> None:
     assert re.fullmatch(r"Model of up to \d+ people, sampled in \d+ steps", repr(magnet.load("duet")))
 
 
-def test_files_may_be_read_as_a_list_and_fields_of_a_sampler_are_refused(tmp_path: Path, duet: Scene) -> None:
+def test_files_may_be_read_as_a_list(tmp_path: Path, duet: Scene) -> None:
     paths = save_bvh(duet, tmp_path / "a.bvh", load_body())
     assert torch.equal(magnet.read(paths).T_world_root, magnet.read(*paths).T_world_root)
-    with pytest.raises(ValueError, match=r"sampler: got \{'steps': 2\}, expected a preset's name or SamplerOptions"):
-        magnet.load("duet", sampler={"steps": 2})  # type: ignore[arg-type]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, astuple, fields
 from typing import Any
 
@@ -53,7 +53,7 @@ class Evaluator(L.LightningModule):
     Args:
         denoiser: the trained model; a peer answers in its own way, whatever the sampler, under its own name.
         task: what is sampled.
-        sampler: how it is sampled.
+        sampler: how it is sampled, as options or a mapping of them.
         samples: scenes drawn for each test scene (paper 4: 10).
         baselines: also measure nearest neighbour, random sample and zero velocity, aligned with the context and as
             found, a ridge regression, training windows in place of samples, and how near samples come to these.
@@ -76,7 +76,7 @@ class Evaluator(L.LightningModule):
         self,
         denoiser: TokenModelCore,
         task: Task | None = None,
-        sampler: SamplerOptions | None = None,
+        sampler: SamplerOptions | Mapping[str, Any] | None = None,
         samples: int = 10,
         baselines: bool = True,
         seed: int = 1111,
@@ -86,7 +86,7 @@ class Evaluator(L.LightningModule):
         super().__init__()
         require_whole("samples", samples, 1)
         require_whole("baseline_stride", baseline_stride, 1)
-        self.denoiser, self.task, self.sampler = denoiser, task or JointFuture(), sampler or SamplerOptions()
+        self.denoiser, self.task, self.sampler = denoiser, task or JointFuture(), SamplerOptions.of(sampler or {})
         self.samples, self.baselines, self.seed = samples, baselines, seed
         self.baseline_stride, self.interval = baseline_stride, interval
         self.results: Results | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -195,3 +197,38 @@ class SamplerOptions:
         if "guidance" in named:
             named = {**named, "guidance": Guidance(**named["guidance"])}
         return cls(**{**named, **said})
+
+    @classmethod
+    def of(cls, said: str | Mapping[str, Any] | SamplerOptions, **more: Any) -> SamplerOptions:
+        """Options from a preset's name, from a mapping of fields as a configuration file has them, or from options.
+
+        Args:
+            said: of a mapping, `guidance` may be a mapping too, and `preset` names the preset that its fields change.
+            more: fields that beat those.
+
+        Raises:
+            ValueError: no such preset or field, with the closest; or a value that does not fit its field.
+        """
+        if isinstance(said, SamplerOptions):
+            return replace(said, **more)
+        if isinstance(said, str):
+            return cls.preset(said, **more)
+        if not isinstance(said, Mapping):
+            wanted = "a preset's name, fields such as {'steps': 2}, or SamplerOptions(steps=2)"
+            raise ValueError(f"sampler: got {said!r}, expected {wanted}")
+        found = {key: value for key, value in {**said, **more}.items() if key != "preset"}
+        _require_fields(cls, found, "sampler")
+        below = cls.preset(str(said.get("preset", "default")))
+        if isinstance(guidance := found.get("guidance"), Mapping):
+            _require_fields(Guidance, guidance, "sampler.guidance")
+            found["guidance"] = replace(below.guidance, **guidance)
+        return replace(below, **found)
+
+
+def _require_fields(kind: Any, said: Mapping[str, Any], name: str) -> None:
+    """Raises ValueError where a class has no field of a name."""
+    known = [each.name for each in fields(kind)]
+    for key in said:
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, n=1)
+            raise ValueError(f"{name} has no field {key}; {f'did you mean {close[0]}?' if close else ', '.join(known)}")

@@ -1,6 +1,9 @@
 """Ways of sampling that have a name."""
 
 import dataclasses
+import re
+from dataclasses import asdict, replace
+from typing import Any
 
 import pytest
 import torch
@@ -93,3 +96,27 @@ def test_the_python_interface_takes_a_preset_by_name():
     assert magnet.load("duet").sampler == SamplerOptions()
     with pytest.raises(ValueError, match="did you mean paper"):
         magnet.load("duet", sampler="paperr")
+
+
+def test_a_mapping_of_fields_is_taken_as_a_file_has_it():
+    said = SamplerOptions.of({"preset": "paper", "steps": 50, "guidance": {"kind": "self"}}, eta=0.5)
+    paper = SamplerOptions.preset("paper", steps=50, eta=0.5)
+    assert said == replace(paper, guidance=replace(paper.guidance, kind="self"))
+    assert SamplerOptions.of(asdict(paper)) == paper == SamplerOptions.of(paper)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"setle": "hold"}, "sampler has no field setle; did you mean settle?"),
+        ({"guidance": {"knd": "self"}}, "sampler.guidance has no field knd; did you mean kind?"),
+        ({"settle": "nonsense"}, "settle: got 'nonsense', expected off or light or firm or hold"),
+        ({"guidance": "history"}, "guidance: got 'history', expected a Guidance"),
+        ({"preset": "papr"}, "papr"),
+        (3, "sampler: got 3, expected a preset's name, fields such as {'steps': 2}, or SamplerOptions(steps=2)"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_refused_in_a_line(said: Any, message: str):
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        SamplerOptions.of(said)
+    assert "\n" not in str(caught.value)
