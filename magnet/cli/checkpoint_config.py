@@ -142,8 +142,10 @@ def import_named(given: Arguments) -> None:
                 raise CommandError(f"{where} {error}") from error
 
 
-def find_checkpoint(name: str | None, folders: Iterable[Path], runs: Path | None = None) -> Path:
-    """What `--ckpt_path` means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
+def find_checkpoint(
+    name: str | None, folders: Iterable[Path], runs: Path | None = None, option: str = "--ckpt_path"
+) -> Path:
+    """What an option means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
 
     Raises:
         CommandError: there is none; says which there are in `runs`.
@@ -152,7 +154,7 @@ def find_checkpoint(name: str | None, folders: Iterable[Path], runs: Path | None
         folders = list(folders)
         found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]
         if not found:
-            raise CommandError(no_run(name, folders, runs))
+            raise CommandError(no_run(name, folders, runs, option))
         return max(found, key=lambda file: file.stat().st_mtime)
     try:
         return checkpoints.resolve(name)

@@ -23,20 +23,21 @@ def newest(place: Path) -> Path | None:
     return max(place.glob("*.ckpt"), key=written, default=None)
 
 
-def no_run(name: str, folders: Iterable[Path], runs: Path | None) -> str:
+def no_run(name: str, folders: Iterable[Path], runs: Path | None, option: str = "--ckpt_path") -> str:
     """Says that no run has a checkpoint `name`, and which checkpoints there are: there, else anywhere.
 
     Args:
         name: last or best.
         folders: where it was looked for.
         runs: where all runs lie.
+        option: that asked for it.
     """
     places = list(dict.fromkeys(folders))
     looked = " or ".join(map(str, places))
     there = newest_of_runs(places) or newest_of_runs([runs] if runs else [])
     which = f"the newest {'are' if len(there) > 1 else 'is'} {', '.join(map(str, there))}" if there else ""
     advice = f"name a file; {which}" if which else "name a file"
-    return f"--ckpt_path {name}: no run with a checkpoints/{name}.ckpt in {looked}; {advice}"
+    return f"{option} {name}: no run with a checkpoints/{name}.ckpt in {looked}; {advice}"
 
 
 def newest_of_runs(folders: Iterable[Path]) -> list[Path]:
@@ -46,8 +47,8 @@ def newest_of_runs(folders: Iterable[Path]) -> list[Path]:
     return sorted(files, key=written, reverse=True)[:NAMED]
 
 
-def told(name: str | None, found: Path) -> Path:
+def told(name: str | None, found: Path, option: str = "--ckpt_path") -> Path:
     """The checkpoint that was found, of which a line says which it is where `last` or `best` was asked for."""
     if name in ("last", "best"):
-        print(f"magnet: --ckpt_path {name} is {found}", file=sys.stderr)
+        print(f"magnet: {option} {name} is {found}", file=sys.stderr)
     return found

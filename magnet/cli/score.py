@@ -97,7 +97,8 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     if name in methods.BASELINES:
         method = methods.baseline(name, task, data)
     else:
-        denoiser = DenoiserCore.load(told(given.method, find_checkpoint(given.method, [Path("runs")])))
+        found = find_checkpoint(given.method, [Path("runs")], option="--method")
+        denoiser = DenoiserCore.load(told(given.method, found, "--method"))
         method = methods.model(denoiser, task, data, samples, SamplerOptions.preset(given.sampler))
     names, joints = answered(data, method, samples, given.seed)
     made = Submission(benchmark.label, given.task, Path(given.method).stem, tuple(names), joints)
