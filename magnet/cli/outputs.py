@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Trainer
+from lightning.pytorch import LightningModule, Trainer
 from rich.console import Console
 from rich.table import Table
 
@@ -96,34 +96,43 @@ def show_metrics(trainer: Trainer, folder: Path, command: str) -> None:
 
 
 def write_scenes(
-    predicted: list[Scene], evaluator: Evaluator, data: Any, folder: Path, picture: str, pictures: int
+    predicted: list[Scene], by: LightningModule, data: Any, folder: Path, picture: str, pictures: int
 ) -> None:
     """Write each test scene's samples as one npz, and the first ones as moving pictures and strips of frames.
 
-    What was sampled and what it cost is written beside them.
+    Of an evaluator, which samples, what was sampled and what it cost is written beside them. Any other model, such as a
+    tokenizer, which reconstructs, makes one scene of each.
     """
     from magnet.export.picture import contact_sheet
     from magnet.export.video import render_video
 
-    rank = f"{evaluator.global_rank}-" if evaluator.trainer.world_size > 1 else ""
+    rank = f"{by.global_rank}-" if by.trainer.world_size > 1 else ""
+    samples = by.samples if isinstance(by, Evaluator) else 1
     number, pictured = 0, []
     for batch in predicted:
-        for first in range(0, batch.scenes, evaluator.samples):
-            scene = batch.select(slice(first, first + evaluator.samples)).to("cpu")
+        for first in range(0, batch.scenes, samples):
+            scene = batch.select(slice(first, first + samples)).to("cpu")
             name = f"{rank}{number:04d}{file_part(scene)}"
             scene.save(folder / "scenes" / f"{name}.npz")
-            if picture != "none" and number < pictures and evaluator.global_rank == 0:
-                shown = [(f"sample {i + 1}", scene.select([i])) for i in range(min(PANELS, scene.scenes))]
-                look = {"context_frames": data.test.context_frames, "body": data.body.to("cpu")}
+            if picture != "none" and number < pictures and by.global_rank == 0:
+                label, given = "sample {}", data.test.context_frames
+                if not isinstance(by, Evaluator):
+                    label, given = type(by).__name__.lower(), 0
+                shown = [(label.format(i + 1), scene.select([i])) for i in range(min(PANELS, scene.scenes))]
+                look = {"context_frames": given, "body": data.body.to("cpu")}
                 pictured.append(render_video(shown, folder / f"{name}.{picture}", progress=True, **look))
                 pictured.append(contact_sheet(shown, folder / f"{name}.png", **look))
             number += 1
-    facts = evaluator.facts() | provenance() | {"machine": machine()}
-    write_text(folder / f"{rank}sampling.json", json.dumps(facts, indent=2, default=str) + "\n")
+    many = ""
+    if isinstance(by, Evaluator):
+        facts = by.facts() | provenance() | {"machine": machine()}
+        write_text(folder / f"{rank}sampling.json", json.dumps(facts, indent=2, default=str) + "\n")
+        many = f" of {counted(samples, 'sample')}"
     for path in pictured:
         print("written:", path)
-    print(cost(facts["sampling"]))
-    print(f"written: {counted(number, 'scene')} of {counted(evaluator.samples, 'sample')} to {folder / 'scenes'}")
+    if isinstance(by, Evaluator):
+        print(cost(facts["sampling"]))
+    print(f"written: {counted(number, 'scene')}{many} to {folder / 'scenes'}")
 
 
 def counted(number: int, what: str) -> str:

@@ -22,6 +22,8 @@ from magnet.datamodules import registry
 DEFAULT_TASK = "joint_future"
 SAMPLING = ("test", "predict")
 RUNS = Path("runs")
+SAMPLED = ("samples", "sampler", "baselines", "baseline_stride", "interval", "seed")
+"""Options that say how tasks are sampled and measured."""
 FILES = {".bvh", ".ckpt", ".csv", ".gif", ".glb", ".html", ".json", ".mp4", ".npz", ".webp"}
 """Suffixes of files; a folder that is named so is a mistake."""
 
@@ -39,6 +41,7 @@ class Request:
         timed: the folder is named by the time.
         classes: those that the layers and flags name under `model` and `data`.
         task: what is sampled, by commands that sample.
+        sampled: the first of `SAMPLED` that the command line names, as it is written.
         topic: of help, where that is asked for.
     """
 
@@ -50,6 +53,7 @@ class Request:
     timed: bool = False
     classes: dict[str, str] = field(default_factory=dict)
     task: TaskChoice | None = None
+    sampled: str | None = None
     topic: str = ""
 
 
@@ -109,7 +113,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
         task = replace(task, asked=bool(fields or given.of("task")))
     layers = [each.text() for each in settled.layers if each.options]
-    return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task)
+    named = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
+    return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task, next(named, None))
 
 
 def require_data(name: str | None) -> None:
@@ -183,15 +188,19 @@ def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[
 
 
 def refuse_task(request: Request, model: object) -> None:
-    """Refuse a task, or an option of one, for a model that samples none: such a model is tested by losses of its own.
+    """Refuse a task, and options of sampling, for a model that samples none: it is tested by losses of its own.
 
-    A task of a file is passed over, for the configuration of any run of `test` has one.
+    Those of a file are passed over, for the configuration of any run of `test` has them.
 
     Raises:
         CommandError: the command line names one.
     """
+    held = f"{request.checkpoint or 'model'} holds a {type(model).__name__.lower()}"
     if request.task is not None and request.task.asked:
+        name = f"--task {request.task.name}"
+        raise CommandError(f"{name}: {held}, and tasks need a denoiser: name one with --ckpt_path, or leave --task out")
+    if request.sampled is not None:
         raise CommandError(
-            f"--task {request.task.name}: {request.checkpoint or 'model'} holds a {type(model).__name__.lower()}, and "
-            f"tasks need a denoiser: name one with --ckpt_path, or leave --task out"
+            f"{request.sampled}: {held}, which samples nothing and has no use for it: name a denoiser with "
+            f"--ckpt_path, or leave {request.sampled} out"
         )

@@ -28,6 +28,7 @@ from magnet.cli.parser import Parser
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
 from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
+from magnet.datamodules.base import MotionDataModule
 from magnet.denoiser.token_model import TokenModel
 from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
@@ -379,10 +380,10 @@ class MagnetCLI(LightningCLI):
     def after_predict(self) -> None:
         """Write scenes and pictures."""
         scenes = [batch for batch in self.predicted if isinstance(batch, Scene)]
-        if self.evaluator is not None and scenes:
+        if scenes and isinstance(self.datamodule, MotionDataModule):
             picture, count = self._option("picture"), self._option("pictures")
             self.folder = self.record.folder  # the first process's, for each writes its own scenes
-            outputs.write_scenes(scenes, self.evaluator, self.datamodule, self.folder, picture, count)
+            outputs.write_scenes(scenes, self.evaluator or self.model, self.datamodule, self.folder, picture, count)
             self._point_to_viewer()
 
     def _point_to_viewer(self) -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from magnet import cli
 from magnet.cli import outputs
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results
-from magnet.testing.models import random_scene
+from magnet.motion.scene import Scene
+from magnet.testing import tiny_tokenizer
+from magnet.testing.models import TINY_TOKENIZER, random_scene
 from tests.evaluation.test_evaluator import data, predicted, run
 
 
@@ -46,6 +49,23 @@ def test_scenes_and_samples_are_counted_in_words_that_fit(tmp_path: Path, capsys
     assert f"written: {scene.scenes} scenes of 1 sample to {tmp_path / 'scenes'}\n" in capsys.readouterr().out
     outputs.write_scenes([scene.select([0])], evaluator, clips, tmp_path, "none", 0)
     assert "written: 1 scene of 1 sample to" in capsys.readouterr().out
+
+
+def test_what_a_tokenizer_reconstructs_is_written_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    kept = {"class_path": "magnet.tokenizer.module.Tokenizer", "init_args": TINY_TOKENIZER}
+    states = {"state_dict": tiny_tokenizer().state_dict(), "magnet_config": {"model": kept}, "global_step": 0}
+    torch.save({**states, "epoch": 0, "pytorch-lightning_version": "2.6.4"}, "codes.ckpt")
+    data = ["--data", "Synthetic", "--data.test_clips", "2", "--data.people", "[2]"]
+    cpu = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--picture", "none"]
+    assert cli.main(["predict", "--ckpt_path", "codes.ckpt", *data, *cpu, "--out", "out"]) == 0
+    scenes = sorted(Path("out/scenes").glob("*.npz"))
+    said = capsys.readouterr().out
+    assert scenes and f"written: {len(scenes)} scenes to {Path('out/scenes')}\n" in said
+    assert f"watch it: magnet view {scenes[0]}\n" in said and "sampling:" not in said
+    assert Scene.load(scenes[0]).scenes == 1 and not Path("out/sampling.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -59,15 +59,41 @@ def test_where_no_run_has_the_checkpoint_those_that_are_there_are_named(
     assert told("fit", mine) == f"{none} mine; name a file; the newest is mine/checkpoints/best.ckpt"
 
 
-@pytest.mark.parametrize("words", ["test --task joint_future", "predict --task=joint_future"])
-def test_a_task_of_a_tokenizer_is_refused_in_a_line(words: str, toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture
+def codes(toy: Path) -> Path:
+    """A tokenizer's checkpoint in the working folder."""
     kept = {"class_path": "magnet.tokenizer.module.Tokenizer", "init_args": TINY_TOKENIZER}
     torch.save({"state_dict": tiny_tokenizer().state_dict(), "magnet_config": {"model": kept}}, toy / "codes.ckpt")
-    assert cli.main([*words.split(), "--ckpt_path", "codes.ckpt", "--out", "out", "--trainer.accelerator", "cpu"]) == 2
+    return Path("codes.ckpt")
+
+
+@pytest.mark.parametrize("words", ["test --task joint_future", "predict --task=joint_future"])
+def test_a_task_of_a_tokenizer_is_refused_in_a_line(
+    words: str, toy: Path, codes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([*words.split(), "--ckpt_path", str(codes), "--out", "out", "--trainer.accelerator", "cpu"]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
     assert told == (
         "magnet: error: --task joint_future: codes.ckpt holds a tokenizer, and tasks need a denoiser: name one with "
         "--ckpt_path, or leave --task out"
+    )
+    assert not (toy / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--samples 3", "--sampler.steps=2", "--sampler paper", "--baselines false", "--interval take", "--seed 3"],
+)
+@pytest.mark.parametrize("command", ["test", "predict"])
+def test_options_of_sampling_of_a_tokenizer_are_refused_in_a_line(
+    command: str, words: str, toy: Path, codes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cpu = ("--trainer.accelerator", "cpu", "--out", "out")
+    assert cli.main([command, *words.split(), "--ckpt_path", str(codes), *cpu]) == 2
+    option = words.replace("=", " ").split()[0]
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"magnet: error: {option}: codes.ckpt holds a tokenizer, which samples nothing and has no use for it: name a "
+        f"denoiser with --ckpt_path, or leave {option} out"
     )
     assert not (toy / "out").exists()
 
