@@ -1,15 +1,19 @@
-"""Where in configuration files an option lies of a class within a list, such as a data set of `Mixed` or a callback."""
+"""Where in configuration files an option stands: file, line and whole key, also of a class within a list.
+
+The parser tells of an option by its class's own name for it, as `batch_size` of `data.init_args.batch_size`.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from magnet.cli.checkpoint_config import class_named, options_of
+from magnet.cli.flags import valued
 
 
 def place_of(layers: Sequence[str], field: str, got: str | None = None) -> tuple[str, str] | None:
@@ -66,8 +70,95 @@ def _options(path: str) -> set[str]:
         return set()
 
 
-def with_place(layers: Sequence[str], told: str) -> str:
-    """The parser's sentence on a value, `--field: got V, expected ...`, with its place where that is in a list."""
+def in_files(
+    files: Sequence[str], field: str, got: str | None = None, known: Collection[str] = ()
+) -> tuple[str, str] | None:
+    """The file and line in which an option stands, and its whole key there, in the last of the files that has it.
+
+    Args:
+        files: of YAML, later ones win.
+        field: the option, with as many of the groups before it as are known.
+        got: the value that does not fit it; None: there is no such option.
+        known: options that there are, as `data.batch_size`, which are not meant.
+
+    Returns:
+        None where no file has it, or where one has several of the name.
+    """
+    end = f".{flat_key(field)}"
+    for file in reversed(files):
+        found = [
+            (f"{file}, line {line}", key)
+            for key, line, value in _entries(file)
+            if f".{flat_key(key)}".endswith(end)
+            and flat_key(key) not in known
+            and (got is None or got in _texts(value))
+        ]
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
+
+
+def flat_key(key: str) -> str:
+    """An option's key in a file as flags name it: `data.batch_size` for `data.init_args.batch_size`."""
+    return re.sub(r"\.init_args(?=[.\[]|$)", "", key)
+
+
+def as_key(flags: str) -> str:
+    """A text in which flags are named, as `--data.batch_size`, with their keys in a file instead."""
+    return re.sub(r"--(?:(model|data)\.)?", lambda match: f"{match[1]}.init_args." if match[1] else "", flags)
+
+
+def _entries(file: str) -> Iterator[tuple[str, int, yaml.Node]]:
+    """Each option in a file: its whole key, the line of that, and what stands behind it."""
+    try:
+        yield from _within(yaml.compose(Path(file).read_text(encoding="utf-8"), yaml.SafeLoader), "")
+    except (OSError, ValueError, yaml.YAMLError):
+        return
+
+
+def _within(node: yaml.Node | None, place: str) -> Iterator[tuple[str, int, yaml.Node]]:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            here = f"{place}.{key.value}".lstrip(".")
+            yield here, key.start_mark.line + 1, value
+            yield from _within(value, here)
+    elif isinstance(node, yaml.SequenceNode):
+        for number, value in enumerate(node.value):
+            yield from _within(value, f"{place}[{number}]")
+
+
+def _texts(value: yaml.Node) -> tuple[str, ...]:
+    """How the parser may write a value."""
+    read = str(yaml.safe_load(yaml.serialize(value, Dumper=yaml.SafeDumper)))
+    return (read, value.value) if isinstance(value, yaml.ScalarNode) else (read,)
+
+
+def with_place(layers: Sequence[str], files: Sequence[str], flags: Sequence[str], told: str) -> str:
+    """The parser's sentence on a value, `--field: got V, expected ...`, with where it stands in a file or a list.
+
+    Args:
+        layers: YAML or files of it.
+        files: the user's own.
+        flags: the command line, whose value needs no place.
+        told: the sentence.
+    """
     match = re.match(r"--([\w.]+): got (.*?), expected ", told)
-    found = match and place_of(layers, match[1], match[2].strip("'\""))
-    return told.replace(f"--{match[1]}", found[0], 1) if match and found else told
+    if match is None:
+        return told
+    field, got = match[1], match[2].strip("'\"")
+    if any(f".{name.lstrip('-')}".endswith(f".{field}") and value.strip("'\"") == got for name, value in valued(flags)):
+        return told
+    if found := in_files(files, field, got):
+        return told.replace(f"--{field}", ": ".join(found), 1)
+    place = place_of(layers, field, got)
+    return told.replace(f"--{field}", place[0], 1) if place else told
+
+
+def of_task(files: Sequence[str], flags: Sequence[str], told: str) -> str:
+    """A sentence on an option of a task or its value, such as `no option --task.FIELD`, with its place in a file."""
+    match = re.match(r"no option --(task\.\w+)", told)
+    if match is None:
+        return with_place((), files, flags, told)
+    given = any(name == f"--{match[1]}" for name, _ in valued(flags))
+    found = None if given else in_files(files, match[1])
+    return f"{found[0]}: {as_key(told)}" if found else told

@@ -18,7 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
-from magnet.cli.nested import place_of, with_place
+from magnet.cli.nested import as_key, flat_key, in_files, place_of, with_place
 
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
@@ -44,7 +44,7 @@ CANDIDATES = r",\s+known\s+subclasses:\s[^)]*\)"
 GROUP = "Path to a configuration file."
 """What jsonargparse says of an option that stands for a group of others; the group's heading says more."""
 
-REFUSED = r"(?:Option|Key) '([^']+)' is not (?:accepted|expected)"
+REFUSED = r"(?:(?:Option|Key) |does not accept option )'([^']+)'(?: is not (?:accepted|expected)|$|\W)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
 
 
@@ -61,6 +61,7 @@ class Parser(LightningArgumentParser):
         self.classes: dict[str, dict[str, type]] = {}
         self.chosen: Mapping[str, str] = {}
         self.layers: list[str] = []
+        self.files: list[str] = []
         self.topic = ""
 
     def parse_args(  # type: ignore[override]
@@ -183,8 +184,8 @@ class Parser(LightningArgumentParser):
         if unknown or refused:
             said = unknown[1].partition("=")[0] if unknown else refused[1] if refused else ""
             name = self._written(said.lstrip("-"), said)
-            if refused and name == said and (found := place_of(self.layers, said)):
-                return f"no option {found[0]}: {found[1]} has no {said}"
+            if refused and not unknown and (told := self._unknown_in_files(said)):
+                return told
             return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)
         if required and required[1] in self.classes:
@@ -197,7 +198,7 @@ class Parser(LightningArgumentParser):
             return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
         key = re.search(r'Parser key "([\w.]+)"', message)
         if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
-            return with_place(self.layers, told)
+            return with_place(self.layers, self.files, self.arguments, told)
         if key and (file := re.search(r"Unable to load config ['\"](.*?)['\"]", message)):
             group = self._written(key[1], f"--{key[1]}")
             return f"{group}: got {file[1]}, expected a YAML file of its fields, or {group}.FIELD VALUE"
@@ -205,10 +206,29 @@ class Parser(LightningArgumentParser):
         lines = [line.strip() for line in message.splitlines() if line.strip()]
         return " ".join(line for line in lines if not line.startswith(NOISE)) or message
 
+    def _unknown_in_files(self, said: str) -> str | None:
+        """What is wrong with an option that there is not, where it stands in a file or a list; else None."""
+        if self._flag_of(said):
+            return None
+        within = place_of(self.layers, said)
+        flags = self._flags()
+        place = in_files(self.files, within[0] if within else said, known={flag.lstrip("-") for flag in flags})
+        where = f"{place[0]}: " if place else ""
+        if within:
+            return f"{where}no option {place[1] if place else within[0]}: {within[1]} has no {said}"
+        if place is None:
+            return None
+        flag = f"--{flat_key(place[1])}"
+        return f"{where}no option {place[1]}{self._had_by_others(flag) or as_key(closest(flag, flags))}"
+
+    def _flag_of(self, field: str) -> str | None:
+        """The flag that gives a field: `--model.foo` for `foo`."""
+        words = [re.match(rf"(--(?:\w+\.)*{re.escape(field)})(?![\w-])", argument) for argument in self.arguments]
+        return next((word[1] for word in words if word), None)
+
     def _written(self, field: str, otherwise: str) -> str:
-        """A field as the user wrote it: `--model.foo` for `foo`."""
-        words = [re.match(rf"(--(?:[\w]+\.)+{re.escape(field)})(?![\w-])", argument) for argument in self.arguments]
-        return next((word[1] for word in words if word), otherwise)
+        """A field as the user wrote it."""
+        return self._flag_of(field) or otherwise
 
     def _had_by_others(self, name: str) -> str:
         """Names another class that has the option; empty if there is none."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magnet import checkpoints
-from magnet.cli import checkpoint_config, class_options, config_files, going_on, run_folder
+from magnet.cli import checkpoint_config, class_options, config_files, going_on, nested, run_folder
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
@@ -36,6 +36,7 @@ class Request:
         command: fit, validate, test or predict.
         flags: of the command line, less configuration files and the task.
         layers: options below them as YAML or files of it, lowest first: the checkpoint's, then those of files.
+        files: those that the user names and that these extend, later ones win.
         checkpoint: to start from.
         folder: of this run.
         timed: the folder is named by the time.
@@ -48,6 +49,7 @@ class Request:
     command: str
     flags: list[str]
     layers: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
     checkpoint: Path | None = None
     folder: Path = Path()
     timed: bool = False
@@ -110,11 +112,15 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     if command in SAMPLING:
         specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
         named = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
-        task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
+        try:
+            task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
+        except CommandError as error:
+            raise CommandError(nested.of_task([each.path for each in given.layers], fields, str(error))) from error
         task = replace(task, asked=bool(fields or given.of("task")))
     layers = [each.text() for each in settled.layers if each.options]
     named = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
-    return Request(command, words, layers, checkpoint, folder, not out, settled.classes, task, next(named, None))
+    read, sampled = [each.path for each in given.layers], next(named, None)
+    return Request(command, words, layers, read, checkpoint, folder, not out, settled.classes, task, sampled)
 
 
 def require_data(name: str | None) -> None:

@@ -189,7 +189,7 @@ class MagnetCLI(LightningCLI):
         assert isinstance(parser, Parser)
         Parser.root, parser.command, parser.arguments = parser, self.command, self.request.flags
         parser.classes, parser.chosen = {"model": self.models, "data": self.data}, self.request.classes
-        parser.layers, parser.topic = self.request.layers, self.request.topic
+        parser.layers, parser.files, parser.topic = self.request.layers, self.request.files, self.request.topic
         self._default_class(parser, "data", registry.default_path())
         parser.explain("seed_everything", "N", EVERYTHING[self.command])
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
