@@ -118,8 +118,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
             raise CommandError(nested.of_task([each.path for each in given.layers], fields, str(error))) from error
         task = replace(task, asked=bool(fields or given.of("task")))
     layers = [each.text() for each in settled.layers if each.options]
-    named = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
-    read, sampled = [each.path for each in given.layers], next(named, None)
+    asked = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
+    read, sampled = [each.path for each in given.layers], next(asked, None)
     return Request(command, words, layers, read, checkpoint, folder, not out, settled.classes, task, sampled)
 
 

@@ -214,8 +214,10 @@ class SamplerOptions:
         if isinstance(said, str):
             return cls.preset(said, **more)
         if not isinstance(said, Mapping):
-            wanted = "a preset's name, fields such as {'steps': 2}, or SamplerOptions(steps=2)"
-            raise ValueError(f"sampler: got {said!r}, expected {wanted}")
+            raise ValueError(
+                f"sampler: got {said!r}, expected a preset's name, fields such as {{'steps': 2}}, or "
+                "SamplerOptions(steps=2)"
+            )
         found = {key: value for key, value in {**said, **more}.items() if key != "preset"}
         _require_fields(cls, found, "sampler")
         below = cls.preset(str(said.get("preset", "default")))
