@@ -83,7 +83,7 @@ def read(
     start: int = 0,
     end: int | None = None,
 ) -> Motion:
-    """Read a scene from our own file, SMPL-X npz files or BVH files of any skeleton; several files are several people.
+    """Read a scene from our own file, SMPL-X npz, or BVH, GLB or FBX of any skeleton; several files are several people.
 
     Args:
         paths: the files, or lists of them.
@@ -94,6 +94,7 @@ def read(
 
     Raises:
         FileNotFoundError: there is no such file.
+        ImportError: an FBX, and no Blender.
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
     options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)

@@ -29,6 +29,7 @@ for example:
   magnet export duet.npz duet.bvh --unit cm
   magnet export duet.npz leader.glb --person 0
   magnet export duet.npz duet.fbx --names mixamo
+  magnet export edited.glb duet.npz                      # back from Blender
   magnet export upstairs.npz duet.npz --on_floor
 """
 
@@ -59,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
     pictures.add_argument("--context", type=int, default=0, metavar="FRAMES", help=context)
     scene_files.add_look(pictures)
     pictures.add_argument("--title", help="written above")
-    bvh = options.add_argument_group("reading .bvh and .npz of other programs")
+    bvh = options.add_argument_group("reading files of other programs")
     scene_files.add_origin(bvh)
     return options
 

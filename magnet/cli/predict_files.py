@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     from magnet.sampling.options import SamplerOptions
 
 HELP = "magnet predict --help files"
-READ = (".npz", ".bvh")
+READ = (".npz", ".bvh", ".glb", ".fbx")
 """`magnet.export.reading.READ`, which would import torch."""
 
 EPILOG = """\
-IN is a .bvh of any skeleton, an SMPL-X .npz or a scene of ours; several are several people of one world, in the order
-in which they are named: A.bvh is person 0. Everything is brought to 30 frames a second and, where other programs wrote
-it, onto the floor. The suffix of OUT says what is written, as for `magnet export`; several OUT are several kinds.
+IN is a .bvh, .glb or .fbx of any skeletons, an SMPL-X .npz or a scene of ours; several are several people of one
+world, in the order in which they are named: A.bvh is person 0. Everything is brought to 30 frames a second and, where
+other programs wrote it, onto the floor. The suffix of OUT says what is written, as for `magnet export`; several OUT
+are several kinds.
 
 for example:
   magnet predict A.bvh B.bvh --out out.glb                               how it goes on for both
@@ -208,7 +209,7 @@ def require_files(paths: Sequence[str]) -> None:
 def files_of(folder: Path) -> str:
     """The first files of a folder that can be read, as they would be given; or what they would be."""
     files = sorted(str(path) for path in folder.iterdir() if path.suffix.lower() in READ)
-    return " ".join(files[:2]) + (" ..." if len(files) > 2 else "") if files else "each person's .bvh or .npz"
+    return " ".join(files[:2]) + (" ..." if len(files) > 2 else "") if files else "each person's .bvh, .glb or .npz"
 
 
 def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:

@@ -29,7 +29,9 @@ OF_FILES = (
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> PlainParser:
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
-    options.add_argument("inputs", nargs=inputs, metavar="IN", help="a .npz or .bvh file; several are several people")
+    options.add_argument(
+        "inputs", nargs=inputs, metavar="IN", help="a .npz, .bvh, .glb or .fbx; several are several people"
+    )
     return options
 
 

@@ -42,7 +42,7 @@ over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:loc
 def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
-    files = "scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh"
+    files = "scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh, .glb, .fbx"
     parser.add_argument("files", nargs="*", metavar="FILE", help=files)
     add = parser.add_argument_group("what is shown").add_argument
     add("--truth", metavar="FILE", help="a scene to show as ghosts in each of the others (default: none)")
@@ -56,7 +56,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--style", choices=styles, help="default: body, light for crowds")
     add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
     add("--html", metavar="OUT.html", help="write a self-contained page that plays everything, and stop")
-    scene_files.add_origin(parser.add_argument_group("reading .bvh and .npz of other programs"))
+    scene_files.add_origin(parser.add_argument_group("reading files of other programs"))
     add = parser.add_argument_group("generating").add_argument
     add("--live", action="store_true", help="a model generates while you watch")
     record = "continue FILE once, keep the steps of its denoising, and watch these"

@@ -48,7 +48,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     slots = slots_to_write(scene, body)
     gltf = _Gltf()
     skin = gltf.skin_of(body)
-    times = gltf.accessor(np.arange(scene.frames, dtype=np.float64) / scene.fps, FLOAT, "SCALAR", bounds=True)
+    times = gltf.accessor(frame_times(scene.frames, scene.fps), FLOAT, "SCALAR", bounds=True)
     shaped: dict[bytes, dict[str, int]] = {}
     scene_clip = _animation("motion")
     for slot in slots:
@@ -87,6 +87,14 @@ def slots_to_write(scene: Scene, body: Body) -> list[int]:
     if not slots or not scene.frames:
         raise ValueError(f"{len(slots)} people and {scene.frames} frames: there is nothing to write")
     return slots
+
+
+def frame_times(frames: int, fps: float) -> NDArray[np.float32]:
+    """Seconds of frames, none rounded down: Blender's exporter would leave the last frame out. -> (T,)"""
+    number = np.arange(frames, dtype=np.float64)
+    times = (number / fps).astype(np.float32)
+    short = times.astype(np.float64) * fps < number
+    return np.where(short, np.nextafter(times, np.float32(np.inf)), times)
 
 
 def _animation(name: str) -> dict[str, Any]:

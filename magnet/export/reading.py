@@ -93,7 +93,9 @@ def read(
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
         also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
-        raise ValueError(f"cannot read {names}: expected .npz files, or of skeletons ({', '.join(RIGS)}){only}")
+        raise ValueError(
+            f"cannot read {names}: expected .npz files alone, or files of skeletons ({', '.join(RIGS)}){only}"
+        )
     for file in files:
         if not file.exists():
             raise FileNotFoundError(f"{file}: no such file")

@@ -18,6 +18,7 @@ from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_bvh, save_glb
 from magnet.export.fbx import save_fbx
+from magnet.export.reading import read
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -81,6 +82,32 @@ def test_a_glb_and_an_fbx_hold_the_bodys_joints_and_skin(blender, duo, body: Bod
     away = np.abs(joints(again) - truth).max()
     report("FBX joints", again, away)
     assert away < 0.05 * MILLIMETRE
+
+
+TO_BLENDER_AND_BACK = """
+import sys, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.scene.render.fps = 30
+bpy.ops.import_scene.gltf(filepath=sys.argv[1])
+bpy.ops.export_scene.gltf(filepath=sys.argv[2], export_format="GLB")
+"""
+
+
+@pytest.mark.parametrize("frames", [60, 64])  # 2.1 s, the last one's time, is rounded down in single precision
+def test_what_blender_writes_again_is_read_back_to_the_last_frame(
+    blender: str, frames: int, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    duo = random_scene(1, frames, 2, torch.Generator().manual_seed(11))
+    save_glb(duo, tmp_path / "duo.glb", body)
+    words = [blender, "-c", TO_BLENDER_AND_BACK, str(tmp_path / "duo.glb"), str(tmp_path / "again.glb")]
+    subprocess.run(words, check=True, capture_output=True)
+    monkeypatch.setenv("MAGNET_BLENDER", blender)
+    for path in (tmp_path / "again.glb", save_fbx(duo, tmp_path / "duo.fbx", body)):
+        got = read(path)
+        away = float((body.joints(got.scene) - body.joints(duo)).norm(dim=-1).max())
+        print(f"{path.suffix} through Blender: {1e3 * away:.5f} mm")
+        assert got.scene.frames == frames and away < 0.01 * MILLIMETRE
+        assert all("the body's own skeleton" in note for note in got.notes)
 
 
 def test_a_bvh_holds_the_bodys_joints(blender, duo: Scene, body: Body, tmp_path: Path):

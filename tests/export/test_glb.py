@@ -17,7 +17,7 @@ from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_glb
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
-from magnet.export.glb import influences, linear, unbroken, vertex_normals
+from magnet.export.glb import frame_times, influences, linear, unbroken, vertex_normals
 from magnet.export.naming import recognised
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -242,3 +242,12 @@ def test_people_who_are_written_alone_keep_their_numbers(trio: Scene, body: Body
         assert [clip.name for clip in opened.gltf.animations] == [f"person_{p}" for p in numbers]
         assert [node.name for node in opened.people()] == [f"person_{p}_body" for p in numbers]
         assert [skin.name for skin in opened.gltf.skins] == [f"person_{p}" for p in numbers]
+
+
+def test_no_time_of_a_frame_is_before_it(body: Body, tmp_path: Path) -> None:
+    """Blender takes whole frames from them and would leave out the last: 2.1 s is frame 62.999997 at 30 a second."""
+    for fps in (24.0, 29.97, 30.0, 60.0, 120.0):
+        times = frame_times(5000, fps)
+        frames = times.astype(np.float64) * fps
+        assert times.dtype == np.float32 and (frames >= np.arange(5000)).all()
+        assert np.abs(frames - np.arange(5000)).max() < 1e-3 and (np.diff(times) > 0).all()
