@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 EPILOG = """\
 OUT's suffix:
   .npz    the scene itself; with --smplx, SMPL-X's conventional keys
-  .bvh    a skeleton a person: out_0.bvh, out_1.bvh ..., all in one world
+  .bvh    a skeleton a person: out_person0.bvh, out_person1.bvh ..., all in one world
   .glb    everybody skinned, coloured and animated in one world
   .fbx    the same, by Blender, where it or its module bpy is
   .usdc .usda .usdz   the same as USD (pip install "magnet-motion[usd]")
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     add("--fps", type=float, help="frames a second of OUT (default: as in IN)")
     add("--on_floor", action="store_true", help="put whoever stands lowest on y = 0, as models need it")
     add("--smplx", action="store_true", help="write .npz with SMPL-X's conventional keys")
-    add("--each", action="store_true", help="with --smplx, a file per person: out_0.npz ..., as most tools expect")
+    add("--each", action="store_true", help="with --smplx, a file a person, out_person0.npz ..., as most tools expect")
     add("--unit", choices=("m", "cm"), default="m", help="lengths in a .bvh (default: %(default)s)")
     add = options.add_argument_group(
         "bones of .glb, .fbx and .usd (defaults: smplx, floor, scene); .bvh takes names"

@@ -31,7 +31,7 @@ TIPS: dict[int, tuple[float, float, float]] = {
 
 
 def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", names: Names = "smplx") -> list[Path]:
-    """Write one scene (B = 1), one file per person: out_0.bvh, out_1.bvh ... by slot, or the path itself for one.
+    """Write one scene (B = 1), a file a person: out_person0.bvh, out_person1.bvh ... by slot; the path itself for one.
 
     All people keep their places in the scene's world, y up. The root's position is the pelvis joint in the world, its
     OFFSET is zero; rotations are Zrotation Xrotation Yrotation in degrees.
@@ -53,7 +53,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
     >>> scene = scene.replace(present=~scene.present)  # two people, in the rest pose
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [path.name for path in save_bvh(scene, Path(folder) / "rest.bvh", load_body())]
-    ['rest_0.bvh', 'rest_1.bvh']
+    ['rest_person0.bvh', 'rest_person1.bvh']
     """
     require_one(scene)
     require_body(scene, body.id)
@@ -81,9 +81,18 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
 
 
 def paths_of(path: Path, slots: Sequence[int]) -> list[Path]:
-    """The files of people in these slots: out_0.bvh, out_1.bvh ..., or the path itself for one person."""
+    """The files of people in these slots: out_person0.bvh, out_person1.bvh ..., or the path itself for one person."""
     path = path.with_suffix(".bvh")
-    return [path] if len(slots) == 1 else [path.with_name(f"{path.stem}_{slot}.bvh") for slot in slots]
+    return [path] if len(slots) == 1 else [person_file(path, slot) for slot in slots]
+
+
+def person_file(path: Path, slot: int) -> Path:
+    """The file of one of several people. By such names they are read as one scene's, by numbers alone not.
+
+    >>> person_file(Path("out.npz"), 2).name
+    'out_person2.npz'
+    """
+    return path.with_name(f"{path.stem}_person{slot}{path.suffix}")
 
 
 def offsets_of(rest: Tensor) -> Tensor:

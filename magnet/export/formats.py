@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from magnet.body import Body, load_body
 from magnet.checks import require_number
 from magnet.export.bones import BoneOptions
-from magnet.export.bvh import Unit, paths_of, save_bvh
+from magnet.export.bvh import Unit, paths_of, person_file, save_bvh
 from magnet.export.cast import Style
 from magnet.export.drawing import Size, require_size
 from magnet.export.fbx import blender, save_fbx
@@ -169,7 +169,7 @@ def write(
         progress: True for a bar while films are drawn, or a function called with (done, all).
         bones: names and hierarchy of bones in GLB, FBX and USD; their names in BVH.
         size: pixels of a film's panel, width and height, even numbers.
-        each: with smplx, a file per person: out_0.npz, out_1.npz ...
+        each: with smplx, a file per person: out_person0.npz, out_person1.npz ...
 
     Returns:
         The paths written.
@@ -226,13 +226,13 @@ def files_of(path: Path, slots: Sequence[Sequence[int]], smplx: bool = False, ea
 
 
 def left_over(written: Sequence[Path]) -> list[Path]:
-    """Files of other people beside those just written, out_2.bvh beside out_0.bvh and out_1.bvh: of another scene."""
+    """Files of other people beside those just written, out_person2.bvh beside those of 0 and 1: of another scene."""
     found: list[Path] = []
-    for last in (path for path in written if path.stem.rpartition("_")[2].isdecimal()):
-        base, _, number = last.stem.rpartition("_")
-        if sum(path.stem.rpartition("_")[0] == base for path in written) < 2:
-            continue  # a number that is part of the name
-        numbered = (last.with_name(f"{base}_{k}{last.suffix}") for k in itertools.count())
+    for last in (path for path in written if path.stem.rpartition("_person")[2].isdecimal()):
+        base, _, number = last.stem.rpartition("_person")
+        if sum(path.stem.rpartition("_person")[0] == base for path in written) < 2:
+            continue  # somebody alone, whose file the user has called so
+        numbered = (person_file(last.with_stem(base), k) for k in itertools.count())
         below = [each for each in itertools.islice(numbered, int(number)) if each.exists()]
         there = [*below, *itertools.takewhile(Path.exists, numbered)]
         found += [each for each in there if {each}.isdisjoint({*written, *found})]

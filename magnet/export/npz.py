@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.export.bvh import person_file
 from magnet.export.rig import UNITS, UP
 from magnet.export.smpl_keys import (
     BODY,
@@ -45,7 +46,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     that pelvises are right in SMPL-X's tools, and `body_betas` (P, 10) keeps the shapes for `read_smplx`.
 
     Args:
-        apart: one file per person (path_0.npz ... by slot) without the axis P, as most tools expect.
+        apart: one file per person (path_person0.npz ... by slot) without the axis P, as most tools expect.
 
     Returns:
         The paths written.
@@ -96,8 +97,8 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
 
 
 def each_of(path: Path, slots: Sequence[int]) -> list[Path]:
-    """The files of people in these slots, written apart: out_0.npz, out_1.npz ..."""
-    return [path.with_name(f"{path.stem}_{slot}.npz") for slot in slots]
+    """The files of people in these slots, written apart: out_person0.npz, out_person1.npz ..."""
+    return [person_file(path, slot) for slot in slots]
 
 
 def is_open(body: Body) -> bool:

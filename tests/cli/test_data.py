@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from magnet import cli
+from magnet.body import load_body
 from magnet.cli import data, data_options
 from magnet.cli.data_shown import NOTES_SHOWN, show_notes
 from magnet.datamodules import registry
+from magnet.datamodules.clip import SPLITS
+from magnet.datamodules.store.reader import StoreReader
+from magnet.synthesis import synthesize
 
 
 @pytest.fixture(scope="module")
@@ -341,3 +346,16 @@ def test_a_folder_of_ones_own_is_recognised_by_its_files_and_a_wrong_table_is_na
     (tmp_path / "dl/more.bvh").touch()
     assert cli.main(words) == 2
     assert "could be bvh or scenes: say which with --name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "out"), [("bvh", ["x.bvh"]), ("scenes", ["x.npz", "--smplx", "--each"])])
+def test_a_couple_that_was_exported_is_prepared_as_one_scene_of_two(name, out, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    synthesize("follow", 2, 340, torch.Generator().manual_seed(1), load_body()).scene.save("couple.npz")
+    Path("people").mkdir()
+    assert cli.main(["export", "couple.npz", f"people/{out[0]}", *out[1:]]) == 0
+    assert {path.stem for path in Path("people").iterdir()} == {"x_person0", "x_person1"}
+    assert cli.main(["data", "prepare", name, "--root", "people", "store", "--workers", "1"]) == 0
+    assert "1 scene of 2 files: x (person0, person1)" in capsys.readouterr().out
+    splits = StoreReader("store").manifest["splits"]
+    assert {split: of["clips by people"] for split, of in splits.items()} == {key: {"2": 1} for key in SPLITS}

@@ -89,7 +89,7 @@ def test_people_of_several_keep_their_numbers_in_the_names_of_files(tmp_path: Pa
     assert cli.main(["export", str(four), str(tmp_path / "some.bvh"), *some]) == 0
     assert cli.main(["export", str(four), str(tmp_path / "some.npz"), *some, "--smplx", "--each"]) == 0
     names = {path.name for path in tmp_path.glob("some*")}
-    assert names == {"some_1.bvh", "some_3.bvh", "some_1.npz", "some_3.npz"}
+    assert names == {"some_person1.bvh", "some_person3.bvh", "some_person1.npz", "some_person3.npz"}
     assert cli.main(["export", str(four), str(tmp_path / "one.bvh"), "--person", "3"]) == 0
     assert (tmp_path / "one.bvh").exists(), "who is alone takes OUT's name"
 
@@ -99,7 +99,7 @@ def test_skeletons_of_two_people_become_one_scene(stored: Path, capsys: pytest.C
     paths = [str(path) for path in save_bvh(scene, stored.with_name("a.bvh"), body, unit="cm")]
     out = stored.with_name("back.npz")
     assert cli.main(["export", *paths, str(out), "--fps", "60"]) == 0
-    assert "a_0.bvh: the body's own skeleton; unit cm, y up" in capsys.readouterr().out
+    assert "a_person0.bvh: the body's own skeleton; unit cm, y up" in capsys.readouterr().out
     back = Scene.load(out)
     assert (back.fps, back.frames, back.agents) == (60.0, 23, 2)
     assert (body.joints(back)[:, ::2] - body.joints(scene)).abs().max() < 1e-4
@@ -222,7 +222,7 @@ def test_smplx_of_the_open_body_says_what_is_written_and_each_gives_a_file_per_p
     source, out = scene.save(tmp_path / "in.npz"), tmp_path / "out.npz"
     assert cli.main(["export", str(source), str(out), "--smplx", "--each"]) == 0
     assert "betas are zero" in capsys.readouterr().out
-    files = [tmp_path / "out_0.npz", tmp_path / "out_1.npz"]
+    files = [tmp_path / "out_person0.npz", tmp_path / "out_person1.npz"]
     assert all(np.load(file)["poses"].shape == (8, 165) for file in files) and not out.exists()
     assert cli.main(["export", *map(str, files), str(out)]) == 0
     back = Scene.load(out)

@@ -28,7 +28,7 @@ def body() -> Body:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: Body) -> Path:
-    """Holds duet.npz and, as another program would have recorded them, take_0.bvh and take_1.bvh."""
+    """Holds duet.npz and, as another program would have recorded them, take_person0.bvh and take_person1.bvh."""
     monkeypatch.chdir(tmp_path)
     scene = random_scene(1, 12, 2, torch.Generator().manual_seed(0)).replace(names=("duet",))
     scene.save(tmp_path / "duet.npz")
@@ -49,18 +49,29 @@ def test_files_that_are_read_are_not_written_over_by_those_of_people(
 ) -> None:
     before = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
     out = ["--out", "take.bvh"] if command == "predict" else ["take.bvh"]
-    assert "take_0.bvh, which is read" in refused(capsys, command, "take_0.bvh", "take_1.bvh", *out)
+    assert "take_person0.bvh, which is read" in refused(capsys, command, "take_person0.bvh", "take_person1.bvh", *out)
     assert before == [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("take_*.bvh"))]
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ["export", "take_0.bvh", "--fps", "30", "take_1.bvh", "o.csv"],
-        ["export", "take_0.bvh", "take_1.bvh", "--trim", "o.csv"],
-        ["refine", "take_0.bvh", "take_1.bvh", "--keep", "0", "--poses", "keep", "o.npz"],
-        ["predict", "take_0.bvh", "--trim", "take_1.bvh", "--out", "o.npz", "--frames", "4", "--sampler.steps", "1"],
-        ["view", "take_0.bvh", "--style", "light", "take_1.bvh", "--html", "o.html"],
+        ["export", "take_person0.bvh", "--fps", "30", "take_person1.bvh", "o.csv"],
+        ["export", "take_person0.bvh", "take_person1.bvh", "--trim", "o.csv"],
+        ["refine", "take_person0.bvh", "take_person1.bvh", "--keep", "0", "--poses", "keep", "o.npz"],
+        [
+            "predict",
+            "take_person0.bvh",
+            "--trim",
+            "take_person1.bvh",
+            "--out",
+            "o.npz",
+            "--frames",
+            "4",
+            "--sampler.steps",
+            "1",
+        ],
+        ["view", "take_person0.bvh", "--style", "light", "take_person1.bvh", "--html", "o.html"],
     ],
     ids=lambda words: " ".join(words[:3]),
 )
@@ -76,13 +87,13 @@ def test_one_file_is_not_two_people(
 ) -> None:
     monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
     out = ["--out", "o.npz"] if command == "predict" else ["o.npz"]
-    said = refused(capsys, command, "take_0.bvh", "take_1.bvh", "./take_0.bvh", *out)
-    assert "take_0.bvh: is given as file 1 and as file 3" in said and not Path("o.npz").exists()
+    said = refused(capsys, command, "take_person0.bvh", "take_person1.bvh", "./take_person0.bvh", *out)
+    assert "take_person0.bvh: is given as file 1 and as file 3" in said and not Path("o.npz").exists()
 
 
 def test_people_in_one_place_are_warned_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("copy.bvh").write_bytes(Path("take_1.bvh").read_bytes())
-    assert cli.main(["export", "take_0.bvh", "take_1.bvh", "copy.bvh", "o.npz"]) == 0
+    Path("copy.bvh").write_bytes(Path("take_person1.bvh").read_bytes())
+    assert cli.main(["export", "take_person0.bvh", "take_person1.bvh", "copy.bvh", "o.npz"]) == 0
     assert "warning: people 1 and 2 are in the same place throughout" in capsys.readouterr().out
     assert cli.main(["export", "duet.npz", "take.csv"]) == 0
     assert "warning" not in capsys.readouterr().out
@@ -99,10 +110,10 @@ def test_a_scene_of_nobody_is_refused_in_a_line(folder: Path, capsys: pytest.Cap
 def test_files_that_out_has_taken_are_not_written_over(
     more: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = Path("take_0.bvh").read_bytes()
-    said = refused(capsys, "predict", "--out", "z.npz", "take_0.bvh", "take_1.bvh", *more)
-    assert "files stand first, then options: magnet predict take_0.bvh take_1.bvh --out z.npz" in said
-    assert Path("take_0.bvh").read_bytes() == before and not Path("z.npz").exists()
+    before = Path("take_person0.bvh").read_bytes()
+    said = refused(capsys, "predict", "--out", "z.npz", "take_person0.bvh", "take_person1.bvh", *more)
+    assert "files stand first, then options: magnet predict take_person0.bvh take_person1.bvh --out z.npz" in said
+    assert Path("take_person0.bvh").read_bytes() == before and not Path("z.npz").exists()
 
 
 def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,11 +125,11 @@ def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: py
 def test_one_person_takes_out_alone_whatever_the_input_is_called(
     command: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = Path("take_0.bvh").read_bytes()
-    assert cli.main([command, "take_0.bvh", "take.bvh"]) == 0
-    assert cli.main(["export", "take_0.bvh", "take_1.bvh", "take.bvh", "--person", "0"]) == 0
+    before = Path("take_person0.bvh").read_bytes()
+    assert cli.main([command, "take_person0.bvh", "take.bvh"]) == 0
+    assert cli.main(["export", "take_person0.bvh", "take_person1.bvh", "take.bvh", "--person", "0"]) == 0
     assert "written: take.bvh" in capsys.readouterr().out
-    assert Path("take_0.bvh").read_bytes() == before
+    assert Path("take_person0.bvh").read_bytes() == before
 
 
 def test_an_input_is_safe_from_people_who_are_counted_only_when_it_is_read(
@@ -130,8 +141,8 @@ def test_an_input_is_safe_from_people_who_are_counted_only_when_it_is_read(
     scene.repeat(2).replace(names=()).save("two_scene1.npz")
     save_bvh(scene, "take_scene1.bvh", load_body())
     for read, *words in (
-        ("take_0.bvh", "predict", "--people", "2", "--out", "take.bvh"),
-        ("take_scene1_0.bvh", "predict", "--people", "2", "--samples", "2", "--out", "take.bvh"),
+        ("take_person0.bvh", "predict", "--people", "2", "--out", "take.bvh"),
+        ("take_scene1_person0.bvh", "predict", "--people", "2", "--samples", "2", "--out", "take.bvh"),
         ("two_scene1.npz", "export", "two.npz", "--smplx"),
     ):
         before = Path(read).read_bytes()
@@ -140,13 +151,15 @@ def test_an_input_is_safe_from_people_who_are_counted_only_when_it_is_read(
 
 
 def test_a_link_to_what_is_read_is_not_written_over(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("linked_1.bvh").symlink_to("take_0.bvh")
-    assert "take_0.bvh, which is read" in refused(capsys, "refine", "take_0.bvh", "take_1.bvh", "linked.bvh")
+    Path("linked_person1.bvh").symlink_to("take_person0.bvh")
+    assert "take_person0.bvh, which is read" in refused(
+        capsys, "refine", "take_person0.bvh", "take_person1.bvh", "linked.bvh"
+    )
 
 
 def test_a_numbered_npz_is_none_of_many(folder: Path) -> None:
-    assert cli.main(["export", "duet.npz", "duet_0.npz"]) == 0
-    assert cli.main(["export", "duet_0.npz", "duet.npz"]) == 0
+    assert cli.main(["export", "duet.npz", "duet_person0.npz"]) == 0
+    assert cli.main(["export", "duet_person0.npz", "duet.npz"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -154,11 +167,11 @@ def test_a_numbered_npz_is_none_of_many(folder: Path) -> None:
     [
         ["export", "duet.npz", "duet.npz"],
         ["export", "duet.npz", "linked.npz"],
-        ["export", "take_0.bvh", "./take_0.bvh"],
-        ["refine", "take_0.bvh", "take_0.bvh"],
+        ["export", "take_person0.bvh", "./take_person0.bvh"],
+        ["refine", "take_person0.bvh", "take_person0.bvh"],
         ["refine", "duet.npz", "other.npz", "duet.npz"],
         ["refine", "duet.npz", "other.npz", "--shapes", "other.npz"],
-        ["predict", "take_0.bvh", "--out", "take_0.bvh"],
+        ["predict", "take_person0.bvh", "--out", "take_person0.bvh"],
         ["predict", "duet.npz", "--out", "o.glb", "duet.npz"],
     ],
     ids=" ".join,
@@ -359,20 +372,20 @@ def test_frames_of_no_files_are_not_chosen(
     assert f"{' '.join(cut[-2:])}: chooses frames of files, and none are read" in said
 
 
-@pytest.mark.parametrize("before", [["--people", "3"], ["take_1.bvh"]], ids=" ".join)
+@pytest.mark.parametrize("before", [["--people", "3"], ["take_person1.bvh"]], ids=" ".join)
 def test_files_behind_a_new_out_are_not_written_over(
     before: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recorded = Path("take_0.bvh").read_bytes()
-    said = refused(capsys, "predict", *before, "--out", "z.glb", "take_0.bvh")
-    assert "take_0.bvh is there, and would be written over" in said and "take_0.bvh --out z.glb" in said
-    assert Path("take_0.bvh").read_bytes() == recorded
+    recorded = Path("take_person0.bvh").read_bytes()
+    said = refused(capsys, "predict", *before, "--out", "z.glb", "take_person0.bvh")
+    assert "take_person0.bvh is there, and would be written over" in said and "take_person0.bvh --out z.glb" in said
+    assert Path("take_person0.bvh").read_bytes() == recorded
 
 
 @pytest.mark.parametrize("first", ["z.glb", "z_0.glb"])
 def test_a_command_may_be_given_again(first: str, folder: Path) -> None:
     Path(first).touch()
-    require_not_there([], ["z.glb", "take_0.bvh"])
-    require_not_there([], ["take_0.bvh", "new.glb"])
-    with pytest.raises(CommandError, match=r"magnet predict a\.bvh take_0\.bvh --out y\.glb y\.mp4;"):
-        require_not_there(["a.bvh"], ["y.glb", "take_0.bvh", "y.mp4"])
+    require_not_there([], ["z.glb", "take_person0.bvh"])
+    require_not_there([], ["take_person0.bvh", "new.glb"])
+    with pytest.raises(CommandError, match=r"magnet predict a\.bvh take_person0\.bvh --out y\.glb y\.mp4;"):
+        require_not_there(["a.bvh"], ["y.glb", "take_person0.bvh", "y.mp4"])

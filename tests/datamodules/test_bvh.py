@@ -51,7 +51,7 @@ def test_a_skeleton_of_the_bodys_own_comes_back_exactly(tmp_path: Path) -> None:
     body = load_body()
     scene = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), body).scene.slice(0, 64)
     save_bvh(scene, tmp_path / "walk.bvh", body, unit="cm")
-    reader = BVHReader(tmp_path, pattern="{scene}_{person}")
+    reader = BVHReader(tmp_path)
     made = canonicalize(whole(reader), body, "walk", "bvh", "train", "positions", CanonicalizeOptions(trust_fps=True))
     (clip,) = made.clips
     found, wanted = body.joints(clip.scene)[0], body.joints(scene)[0]

@@ -30,7 +30,7 @@ def trio() -> Scene:
 @pytest.mark.parametrize("unit", ["m", "cm"])
 def test_joints_and_skin_return_within_a_hundredth_of_a_millimetre(unit, trio: Scene, body: Body, tmp_path: Path):
     paths = save_bvh(trio, tmp_path / "trio.bvh", body, unit=unit)
-    assert [path.name for path in paths] == ["trio_0.bvh", "trio_1.bvh", "trio_2.bvh"]
+    assert [path.name for path in paths] == ["trio_person0.bvh", "trio_person1.bvh", "trio_person2.bvh"]
     back = load_rigs(paths, body)
     assert all(source.exact and source.unit == unit and source.up == "y" for source in back.sources)
     assert (back.scene.fps, back.scene.body, back.floor) == (30.0, trio.body, 0.0)

@@ -92,7 +92,7 @@ def test_several_scenes_go_into_a_file_each_where_a_format_holds_one(duet: Scene
         suffix: [p.name for p in formats.write(both, tmp_path / f"a{suffix}", body)] for suffix in (".glb", ".bvh")
     }
     assert names[".glb"] == ["a_scene0.glb", "a_scene1.glb"]
-    assert names[".bvh"] == ["a_scene0_0.bvh", "a_scene0_1.bvh", "a_scene1_0.bvh", "a_scene1_1.bvh"]
+    assert names[".bvh"] == [f"a_scene{s}_person{p}.bvh" for s in range(2) for p in range(2)]
     assert [p.name for p in formats.write(both, tmp_path / "a.csv", body)] == ["a.csv"]
     assert reading.read(formats.write(both, tmp_path / "b.npz", body)).scene.scenes == 2
 
@@ -196,21 +196,21 @@ def test_files_of_more_people_from_before_are_named_and_stay(options: dict, duet
     kind = ".npz" if options else ".bvh"
     four = magnet.Motion.of(cat_agents([duet, duet]))
     four.save(tmp_path / f"st{kind}", **options)
-    said = f"^st_2{kind}, st_3{kind}: lie beside what was written and are no part of it"
+    said = f"^st_person2{kind}, st_person3{kind}: lie beside what was written and are no part of it"
     with pytest.warns(UserWarning, match=said):
         magnet.Motion.of(duet).save(tmp_path / f"st{kind}", **options)
     assert len(list(tmp_path.iterdir())) == 4
-    assert not formats.left_over([tmp_path / f"st_{p}{kind}" for p in range(4)])
-    assert not formats.left_over([tmp_path / f"st_1{kind}"])  # a person alone, who is called so
+    assert not formats.left_over([tmp_path / f"st_person{p}{kind}" for p in range(4)])
+    assert not formats.left_over([tmp_path / f"st_person1{kind}"])  # a person alone, who is called so
 
 
 def test_files_of_people_before_and_between_those_written_are_named(tmp_path: Path) -> None:
     """Whoever is exported alone keeps a number, so that others' files may lie below it."""
-    files = [tmp_path / f"st_{person}.bvh" for person in (0, 1, 2, 3, 4, 6)]
+    files = [tmp_path / f"st_person{person}.bvh" for person in (0, 1, 2, 3, 4, 6)]
     for file in files:
         file.touch()
     assert formats.left_over([files[1], files[3]]) == [files[0], files[2], files[4]]
-    assert not formats.left_over([files[3], tmp_path / "other_1.bvh"])  # no people of one scene
+    assert not formats.left_over([files[3], tmp_path / "other_person1.bvh"])  # no people of one scene
 
 
 def test_commands_name_files_of_more_people_from_before(
@@ -218,4 +218,4 @@ def test_commands_name_files_of_more_people_from_before(
 ) -> None:
     formats.write(cat_agents([duet, duet]), tmp_path / "st.bvh")
     assert cli.main(["export", str(duet.save(tmp_path / "duet")), str(tmp_path / "st.bvh")]) == 0
-    assert "st_2.bvh, st_3.bvh: lie beside" in capsys.readouterr().out
+    assert "st_person2.bvh, st_person3.bvh: lie beside" in capsys.readouterr().out

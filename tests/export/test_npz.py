@@ -58,7 +58,7 @@ def test_keys_are_the_conventional_ones(whose: str, trio: Scene, body: Body, tmp
 def test_one_file_a_person_holds_that_person(trio: Scene, body: Body, tmp_path: Path) -> None:
     gone = trio.replace(present=torch.tensor([[True, False, True]]))
     paths = save_smplx(gone, tmp_path / "trio", body, apart=True)
-    assert [path.name for path in paths] == ["trio_0.npz", "trio_2.npz"], "numbered as in the scene"
+    assert [path.name for path in paths] == ["trio_person0.npz", "trio_person2.npz"], "numbered as in the scene"
     back = load_smplx(paths[1], body)
     assert back.agents == 1
     assert (body.joints(back) - body.joints(trio)[:, :, 2:]).abs().max() < 1e-4

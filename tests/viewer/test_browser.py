@@ -108,7 +108,7 @@ def test_every_format_is_downloaded(page, panel, handshake, body, tmp_path) -> N
             files[kind] = panel.downloaded(kind, f"dance.{'zip' if kind == 'bvh' else kind}", tmp_path)
             assert files[kind].read_bytes().startswith(begins[kind]), kind
     assert Scene.load(files["npz"]).given.sum() == 16
-    assert zipfile.ZipFile(files["bvh"]).namelist() == ["scene_0.bvh", "scene_1.bvh"]
+    assert zipfile.ZipFile(files["bvh"]).namelist() == ["scene_person0.bvh", "scene_person1.bvh"]
     page.goto(files["html"].as_uri())
     page.wait_for_function("window.player && player.drawn > 2")
     shot(page, "page_downloaded")

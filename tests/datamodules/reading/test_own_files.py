@@ -27,6 +27,7 @@ def told(groups: list[SceneFiles]) -> dict[str, list[str]]:
         (["dance_A.bvh", "dance_B.bvh"], {"dance": ["A", "B"]}),
         (["dance-a.bvh", "dance-b.bvh", "dance-c.bvh"], {"dance": ["a", "b", "c"]}),
         (["x person1.bvh", "x person2.bvh"], {"x": ["person1", "person2"]}),
+        (["x_person0.bvh", "x_person3.bvh"], {"x": ["person0", "person3"]}),
         (["x.leader.bvh", "x.follower.bvh"], {"x": ["follower", "leader"]}),
         (["day/one_P1.BVH", "day/one_P2.bvh", "one_P1.bvh"], {"day/one": ["P1", "P2"], "one_P1": [""]}),
         (["duel/A.bvh", "duel/B.bvh", "walk/A.bvh"], {"duel": ["A", "B"], "walk/A": [""]}),
