@@ -8,6 +8,7 @@ import os
 import secrets
 import shutil
 import tempfile
+import unicodedata
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -18,6 +19,8 @@ import numpy as np
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+JOINERS = "\u200c\u200d"
+"""Signs without a width that stand inside words of some scripts."""
 ANYHOW, RATIO = 64 * 2**20, 100
 """Any array of an npz may unpack to so many bytes, and a larger one to so many times its packed size."""
 
@@ -134,7 +137,7 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
         if target.exists() and not (target.is_file() and os.access(target.parent, os.W_OK)):
             yield path
             return
-        part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
+        part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
         try:
             yield part
             if target.exists():
@@ -149,6 +152,22 @@ def write_text(path: str | Path, text: str) -> Path:
     with whole(path) as part:
         part.write_text(text, encoding="utf-8")
     return Path(path)
+
+
+def file_word(text: str) -> str:
+    """A name as part of a file's: letters, digits and marks of letters, of any script, composed; `_` for all between.
+
+    >>> file_word("cafe\u0301 #2"), file_word("\u0928\u0943\u0924\u094d\u092f/1") == "\u0928\u0943\u0924\u094d\u092f_1"
+    ('café_2', True)
+    """
+    word = ""
+    for sign in unicodedata.normalize("NFC", text):
+        mark = unicodedata.category(sign) in ("Mn", "Mc") and not "\ufe00" <= sign <= "\ufe0f"  # which choose a picture
+        if sign.isalnum() or (mark and word[-1:] not in ("", "_")):
+            word += sign
+        elif sign not in JOINERS and not word.endswith("_"):
+            word += "_"
+    return word.strip("_")
 
 
 class HashedFile:

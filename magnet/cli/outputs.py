@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import sys
-import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from rich.table import Table
 from magnet.cli.provenance import machine, provenance
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results, print_table
-from magnet.files import write_text
+from magnet.files import file_word, write_text
 from magnet.motion.scene import Scene
 
 PANELS = 4
@@ -141,7 +139,6 @@ def counted(number: int, what: str) -> str:
 
 
 def file_part(scene: Scene) -> str:
-    """Its name for a file's, behind `_`: letters and digits of any script, an accent as part of its letter."""
-    name = unicodedata.normalize("NFC", scene.names[0] if scene.names else "")
-    name = re.sub(r"[\W_]+", "_", name).strip("_")
+    """Its name for a file's, behind `_`."""
+    name = file_word(scene.names[0] if scene.names else "")
     return f"_{name}" if name else ""

@@ -11,6 +11,7 @@ import numpy as np
 
 from magnet.body.base import Body
 from magnet.export.page.rig import VIEWS, Array
+from magnet.files import file_word
 from magnet.motion.scene import FPS
 from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
@@ -181,7 +182,7 @@ class ViewerBase:
             button.disabled = True
             try:
                 suffix, content = saved(view.take, self.body, kind.value, view.truth)
-                name = "".join(c if c.isalnum() else "_" for c in view.take.label) or "scene"
+                name = file_word(view.take.label) or "scene"
                 event.client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
             except (ValueError, OSError, ImportError) as error:
                 event.client.add_notification("Not saved", str(error), color="red", auto_close_seconds=TOLD)

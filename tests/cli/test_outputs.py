@@ -73,6 +73,10 @@ def test_what_a_tokenizer_reconstructs_is_written_and_told(
     [
         ("Été à Séville 4[0:122]", "_Été_à_Séville_4_0_122"),
         ("E\u0301te\u0301/1", "_Été_1"),  # accents as signs of their own, as some systems write them
+        ("अल\u094dपना नृत्य", "_अल\u094dपना_नृत्य"),  # vowel signs are marks behind their letters
+        ("รำวง ครั้งที่ 1", "_รำวง_ครั้งที่_1"),
+        ("می\u200cرقصند", "_میرقصند"),  # a joiner that nobody sees
+        ("\u0301a 1\ufe0f\u20e3 \u2764\ufe0f", "_a_1"),  # marks of no letter
         ("社交ダンス #2", "_社交ダンス_2"),
         ("take_03 [30:60]", "_take_03_30_60"),
         ("../?", ""),
