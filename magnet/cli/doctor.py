@@ -243,5 +243,5 @@ def _runs(folder: Path) -> Finding:
         advice = "change to another folder, or give --out"
         return Finding("files", "runs", "wrong", f"{above.resolve()} cannot be written to", advice)
     free = shutil.disk_usage(above).free / 1e9
-    count = sum(1 for path in folder.glob("*/*/run.json")) if folder.is_dir() else 0
+    count = sum(not path.parent.is_symlink() for path in folder.glob("*/*/run.json")) if folder.is_dir() else 0
     return Finding("files", "runs", "ok", f"{folder.resolve()}, {count} runs, {free:.0f} GB free")

@@ -317,7 +317,8 @@ class Record(Callback):
         config: the whole configuration as YAML.
         options: {"model": ..., "data": ...} in plain values, for checkpoints.
         facts: what else run.json says.
-        latest: keep a link `latest` beside the folder that leads to it once there is a checkpoint.
+        latest: keep a link `latest` beside the folder that leads to it once there is a checkpoint, or, where nothing
+            is trained, once all is measured or sampled.
         goes_on: in the folder of the training that it goes on with, whose record is kept under another name.
         command: of the run.
     """
@@ -362,6 +363,13 @@ class Record(Callback):
         write_text(self.folder / f"run{own}.json", json.dumps(provenance() | self.facts, indent=2) + "\n")
 
     on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
+
+    def _end(self, *_: Any, **__: Any) -> None:
+        link = self.folder.with_name(LATEST)
+        if self.begun and self.latest and self.command != "fit" and not (link / "checkpoints").is_dir():
+            point(link, self.folder)  # but a training's of the same configuration stays
+
+    on_validation_end = on_test_end = on_predict_end = _end
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[CONFIG_KEY] = self.options

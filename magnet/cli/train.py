@@ -311,7 +311,7 @@ class MagnetCLI(LightningCLI):
         config = self._parser(self.command).dump(settings, skip_none=False)
         facts = run_folder.seeds(self.config_dump)
         facts["checkpoint"] = None if self.checkpoint is None else str(self.checkpoint)
-        latest = self.command == "fit" and self._option("out") is None
+        latest = self._option("out") is None
         return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on, self.command)
 
     def _option(self, name: str) -> Any:
