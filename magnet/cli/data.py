@@ -279,7 +279,7 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import registry
     from magnet.datamodules.options import HELD_OUT
-    from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits
+    from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits, summary_of
     from magnet.datamodules.preparing.progress import progress_bar
 
     if given.place and given.out and given.place != given.out:
@@ -293,7 +293,7 @@ def run_prepare(given: argparse.Namespace) -> int:
     with progress_bar() as tell:
         report = prepare(job, out, workers=given.workers, splits=splits, limit=given.limit, progress=tell)
     m = report.folder.manifest
-    for line in job.reader().summary():
+    for line in summary_of(job.reader()):
         print(f"note: {line}")
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))

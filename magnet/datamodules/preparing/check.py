@@ -18,7 +18,7 @@ from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing import check_people
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all
 from magnet.datamodules.preparing.pack import split_counts
-from magnet.datamodules.preparing.prepare import absent_note, select_takes
+from magnet.datamodules.preparing.prepare import absent_note, select_takes, summary_of
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own import FEW, OwnReader, seconds_needed
 from magnet.datamodules.reading.recording import DataError, Reader, Take
@@ -233,7 +233,7 @@ def check_download(
     found = CheckReport(reader.name, reader.title, limited=limit is not None)
     use = select_takes(reader, splits, limit)
     takes = use.takes
-    found.notes += reader.summary()
+    found.notes += summary_of(reader)
     if use.left_out:
         whose = "the data set's rule" if splits is None else "the list given"
         found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")

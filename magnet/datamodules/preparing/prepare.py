@@ -167,6 +167,16 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
     return TakeSelection(used, left_out, absent)
 
 
+def summary_of(reader: Reader) -> list[str]:
+    """What a reader says of what it found; where a stranger's fails at that, that it did: no take depends on it."""
+    try:
+        with named_errors(type(reader), "its summary cannot be made"):
+            lines = reader.summary()
+            return [lines] if isinstance(lines, str) else [str(line) for line in lines]
+    except DataError as error:
+        return [str(error)]
+
+
 def absent_note(names: list[str], most: int = 5) -> str:
     """Says which names of the lists the download lacks; perhaps it was not unpacked completely."""
     more = f" and {len(names) - most} more" if len(names) > most else ""

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from magnet import cli
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.check import check_download
 from magnet.datamodules.preparing.convert import PrepareJob
-from magnet.datamodules.preparing.prepare import prepare
+from magnet.datamodules.preparing.prepare import prepare, summary_of
 from magnet.datamodules.reading.recording import DataError
 from tests.datamodules import made
 
@@ -61,3 +62,26 @@ def test_a_take_at_which_a_reader_ends_the_program_is_skipped(
     monkeypatch.setattr(made.MadeReader, "read", ends)
     report = prepare(job, tmp_path / "store")
     assert report.failed == 1 and "SystemExit: bye" in report.folder.manifest["skipped"][0]["why"]
+
+
+@pytest.mark.parametrize("error", [KeyError("id"), SystemExit(3), ValueError("odd"), None], ids=repr)
+def test_a_summary_that_fails_is_a_note_and_ends_nothing(
+    error: BaseException | None, job: PrepareJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None: it gives no list."""
+    monkeypatch.setattr(made.MadeReader, "summary", raising(error) if error else lambda self: None)
+    (note,) = (line for line in check_download(job).notes if line.startswith("Made: "))
+    assert note == summary_of(job.reader())[0] and "\n" not in note
+    assert "odd" in note if isinstance(error, ValueError) else "its summary cannot be made (" in note
+    monkeypatch.setattr(made.MadeReader, "summary", lambda self: "one line")
+    assert summary_of(job.reader()) == ["one line"]
+
+
+def test_a_command_goes_on_behind_a_summary_that_fails(
+    job: PrepareJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(made.MadeReader, "summary", raising(KeyError("id")))
+    words = ["--root", job.root, str(tmp_path / "store"), "--body", job.body_file, "--workers", "1"]
+    assert cli.main(["data", "prepare", made.NAME, *words]) == 0
+    said = capsys.readouterr().out
+    assert "note: Made: its summary cannot be made (KeyError: 'id'); mend " in said and "takes are in" in said
