@@ -278,7 +278,6 @@ def refuse_unused(given: argparse.Namespace, what: str, *used: str) -> None:
 
 def run_prepare(given: argparse.Namespace) -> int:
     from magnet.datamodules import registry
-    from magnet.datamodules.options import HELD_OUT
     from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits, summary_of
     from magnet.datamodules.preparing.progress import progress_bar
 
@@ -301,22 +300,32 @@ def run_prepare(given: argparse.Namespace) -> int:
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     show_gaps(m["splits"], "limit" in m)
     takes = sum(split["takes"] for split in m["splits"].values())
-    kind = registry.reader(name)
-    body = "" if given.body == "open" else f" --data.body_model {shlex.quote(given.body)}"
-    place = shlex.quote(str(out))
     said = f"{takes} takes are in {out}; {len(m['skipped'])} were skipped."
     if why := why_untrained(m):
         print(f"{said} Nothing can be trained on it, for split train is empty: {why}")
         return 0
     print(f"{said} To train on it:")
     longest = int(report.folder.split("test").frames.max(initial=0))
-    if kind.own:
-        tuned = f"magnet fit --config {TUNING} --data.path {place}{body}"
-        note = f"the shipped model goes on with it; {WHERE_CONFIGS}"
-        print(f"  {tuned}{shorter_tests(longest, TUNED_HORIZON)}   # {note}")
-    usual = f"{registry.fit_command(registry.data_of(kind))} --data.path {place}{body}"
-    print(f"  {usual}{shorter_tests(longest, HELD_OUT.horizon_frames)}")
+    for line in training_commands(name, out, given.body, longest):
+        print(f"  {line}")
     return 0
+
+
+def training_commands(name: str, out: str, body: str, longest: int) -> list[str]:
+    """How to train on a store: to go on with the shipped model, where the body is its, the open one; a tokenizer anew.
+
+    longest: frames of the longest test clip.
+    """
+    from magnet.datamodules import registry
+    from magnet.datamodules.options import HELD_OUT
+
+    place = f"--data.path {shlex.quote(str(out))}"
+    usual = f"{registry.fit_command(registry.data_of(registry.reader(name)))} {place}"
+    if body != "open":
+        usual = f"{usual} --data.body_model {shlex.quote(body)}"
+    usual += shorter_tests(longest, HELD_OUT.horizon_frames)
+    tuned = f"magnet fit --config {TUNING} {place}{shorter_tests(longest, TUNED_HORIZON)}"
+    return [f"{tuned}   # the shipped model goes on with it; {WHERE_CONFIGS}"] * (body == "open") + [usual]
 
 
 def shorter_tests(longest: int, horizon: int) -> str:

@@ -75,7 +75,7 @@ def show_reader(console: Console, kind: type[Reader]) -> None:
     body = BODIES.get(family, "")
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
     show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
-    if kind.own:
+    if not body:  # the open one will do, which is the shipped model's
         show(console, "", f"magnet fit --config {TUNING} --data.path STORE   # {WHERE_CONFIGS}")
     show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
     if body:

@@ -359,3 +359,16 @@ def test_a_couple_that_was_exported_is_prepared_as_one_scene_of_two(name, out, t
     assert "1 scene of 2 files: x (person0, person1)" in capsys.readouterr().out
     splits = StoreReader("store").manifest["splits"]
     assert {split: of["clips by people"] for split, of in splits.items()} == {key: {"2": 1} for key in SPLITS}
+
+
+@pytest.mark.parametrize("name", ["bvh", "scenes", "cmu", "remocap"])
+def test_the_shipped_model_is_proposed_for_every_store_of_its_body(name, capsys):
+    tuned, usual = data.training_commands(name, "a store", "open", 300)
+    assert tuned.startswith("magnet fit --config configs/finetune.yaml --data.path 'a store'   # the shipped model")
+    assert usual == f"{registry.fit_command(registry.data_of(registry.reader(name)))} --data.path 'a store'"
+    (usual,) = data.training_commands(name, "store", "SMPLX.npz", 300)
+    assert usual.endswith(" --data.path store --data.body_model SMPLX.npz")
+    assert (
+        cli.main(["data", "list", name]) == 0 and "configs/finetune.yaml --data.path STORE" in capsys.readouterr().out
+    )
+    assert cli.main(["data", "list", "dd100"]) == 0 and "finetune" not in capsys.readouterr().out
