@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli import answers
 from magnet.cli.data_options import all_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
-    TUNING,
-    WHERE_CONFIGS,
     add_list,
     file_bars,
     run_list,
@@ -23,6 +21,7 @@ from magnet.cli.data_shown import (
     show_problems,
     show_skipped,
     show_splits,
+    training_commands,
     why_untrained,
 )
 from magnet.cli.errors import CommandError, no_such
@@ -45,8 +44,6 @@ Prepare, check, describe, fake and download data sets.
 """
 FAILED = 1
 """Exit code of a check that found a problem."""
-TUNED_HORIZON = 90
-"""Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -214,29 +211,46 @@ def run_info(given: argparse.Namespace) -> int:
 
 def run_check(given: argparse.Namespace) -> int:
     from magnet.datamodules.preparing import check
-    from magnet.datamodules.store.reader import MANIFEST, STATE
-    from magnet.files import require_place
+    from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
 
-    if given.picture not in (None, "none"):
-        require_place(given.picture)
     path = Path(needed(given, "path")[0]).expanduser()
     if (path / MANIFEST).exists() or (path / STATE).is_dir():
+        picture = picture_of(given, StoreReader(path).manifest["name"])
         found, body = checked_store(given, path)
     elif not path.is_dir():
         raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
     else:
-        found, body = checked_download(given, given.name or check.recognise(path), path)
+        name = given.name or check.recognise(path)
+        picture = picture_of(given, name)
+        found, body = checked_download(given, name, path)
     show_splits(found.splits, title=found.title)
     show_notes(found.notes)
     show_skipped(found.skipped)
     show_gaps(found.splits, found.limited)
-    picture = Path(given.picture or f"{found.name}_check.png")
-    if given.picture != "none" and check.draw(found, picture, body):
+    if picture is not None and check.draw(found, picture, body):
         print(f"picture: {picture}")
     show_problems(found.problems)
     count = len(found.problems)
     print(f"{count} problem{'s' * (count > 1)}" if count else "all assertions hold")
     return FAILED if found.problems else 0
+
+
+def picture_of(given: argparse.Namespace, name: str) -> Path | None:
+    """The picture to write, where one can be written; None: none is wanted. name: of the data set, which names it.
+
+    Raises:
+        CannotWrite: no file can be written there.
+    """
+    from magnet.files import CannotWrite, require_place
+
+    if given.picture == "none":
+        return None
+    picture = Path(given.picture or f"{name}_check.png")
+    try:
+        require_place(picture)
+    except CannotWrite as error:
+        raise CannotWrite(f"{error} (--picture FILE, or --picture none)") from error
+    return picture
 
 
 def checked_store(given: argparse.Namespace, path: Path) -> tuple[CheckReport, Body | None]:
@@ -309,31 +323,6 @@ def run_prepare(given: argparse.Namespace) -> int:
     for line in training_commands(name, out, given.body, longest):
         print(f"  {line}")
     return 0
-
-
-def training_commands(name: str, out: str, body: str, longest: int) -> list[str]:
-    """How to train on a store: to go on with the shipped model, where the body is its, the open one; a tokenizer anew.
-
-    longest: frames of the longest test clip.
-    """
-    from magnet.datamodules import registry
-    from magnet.datamodules.options import HELD_OUT
-
-    place = f"--data.path {shlex.quote(str(out))}"
-    usual = f"{registry.fit_command(registry.data_of(registry.reader(name)))} {place}"
-    if body != "open":
-        usual = f"{usual} --data.body_model {shlex.quote(body)}"
-    usual += shorter_tests(longest, HELD_OUT.horizon_frames)
-    tuned = f"magnet fit --config {TUNING} {place}{shorter_tests(longest, TUNED_HORIZON)}"
-    return [f"{tuned}   # the shipped model goes on with it; {WHERE_CONFIGS}"] * (body == "open") + [usual]
-
-
-def shorter_tests(longest: int, horizon: int) -> str:
-    """The option without which no test scene would fit into the longest test clip, for a command; "" where some do."""
-    from magnet.datamodules.options import HELD_OUT
-
-    rest = longest - HELD_OUT.context_frames
-    return f" --data.test.horizon_frames {rest}" if 0 < rest < horizon else ""
 
 
 def run_fake(given: argparse.Namespace) -> int:

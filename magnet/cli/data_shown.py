@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -102,6 +103,8 @@ def show(console: Console, what: str, text: str) -> None:
 
 SKIPPED_SHOWN = 20
 TUNING, WHERE_CONFIGS = "configs/finetune.yaml", "configs/ is in a clone of the repository"
+TUNED_HORIZON = 90
+"""Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
 PROBLEMS_SHOWN = 40
 PERSONS_SHOWN = 8
 NOTES_SHOWN = 8
@@ -188,6 +191,31 @@ def show_persons(groups: list[tuple[list[str], int]]) -> None:
     groups = sorted(groups, key=lambda group: -group[1])
     lines = [f"people: {' | '.join(names)} ({takes} takes)" for names, takes in groups]
     show_some(lines, PERSONS_SHOWN, " groups, all of them in the store's manifest.json")
+
+
+def training_commands(name: str, out: str, body: str, longest: int) -> list[str]:
+    """How to train on a store: to go on with the shipped model, where the body is its, the open one; a tokenizer anew.
+
+    longest: frames of the longest test clip.
+    """
+    from magnet.datamodules import registry
+    from magnet.datamodules.options import HELD_OUT
+
+    place = f"--data.path {shlex.quote(str(out))}"
+    usual = f"{registry.fit_command(registry.data_of(registry.reader(name)))} {place}"
+    if body != "open":
+        usual = f"{usual} --data.body_model {shlex.quote(body)}"
+    usual += shorter_tests(longest, HELD_OUT.horizon_frames)
+    tuned = f"magnet fit --config {TUNING} {place}{shorter_tests(longest, TUNED_HORIZON)}"
+    return [f"{tuned}   # the shipped model goes on with it; {WHERE_CONFIGS}"] * (body == "open") + [usual]
+
+
+def shorter_tests(longest: int, horizon: int) -> str:
+    """The option without which no test scene would fit into the longest test clip, for a command; "" where some do."""
+    from magnet.datamodules.options import HELD_OUT
+
+    rest = longest - HELD_OUT.context_frames
+    return f" --data.test.horizon_frames {rest}" if 0 < rest < horizon else ""
 
 
 def file_bars() -> AbstractContextManager[Callable[[str, int, int | None], None]]:

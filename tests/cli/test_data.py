@@ -13,7 +13,7 @@ import yaml
 
 from magnet import cli
 from magnet.body import load_body
-from magnet.cli import data, data_options
+from magnet.cli import data, data_options, data_shown
 from magnet.cli.data_shown import NOTES_SHOWN, show_notes
 from magnet.datamodules import registry
 from magnet.datamodules.clip import SPLITS
@@ -80,6 +80,16 @@ def test_a_place_that_cannot_be_made_is_said_before_the_work(copy, capsys):
     assert "/proc/store/seen.png: /proc/store cannot be made (" in said.err and not said.out
 
 
+@pytest.mark.parametrize("what", ["store", "dl"])
+def test_a_picture_that_cannot_be_written_is_said_before_the_work(what, copy, monkeypatch, capsys):
+    for work in ("check_store", "check_download"):
+        monkeypatch.setattr(f"magnet.datamodules.preparing.check.{work}", lambda *_: pytest.fail("was checked"))
+    Path("dd100_check.png").mkdir()
+    assert cli.main(["data", "check", what, "--body", "dl/body.npz"]) == 2
+    said = capsys.readouterr()
+    assert "dd100_check.png: is a folder, expected" in said.err and "--picture none" in said.err and not said.out
+
+
 def test_a_check_is_drawn_with_the_open_body_where_the_own_is_not_given(copy, capsys):
     assert cli.main(["data", "check", "store", "--picture", "seen.png"]) == 0
     assert "picture: seen.png" in capsys.readouterr().out
@@ -121,8 +131,13 @@ def test_an_up_axis_may_be_said_as_for_export(said, up):
 
 def test_tests_that_would_not_fit_into_the_takes_are_made_shorter_in_the_command(tmp_path, capsys):
     config = yaml.safe_load((Path(__file__).parents[2] / "configs" / "finetune.yaml").read_text())
-    assert config["data"]["init_args"]["test"]["horizon_frames"] == data.TUNED_HORIZON
-    assert [data.shorter_tests(n, 90) for n in (0, 32, 121, 122)] == ["", "", " --data.test.horizon_frames 89", ""]
+    assert config["data"]["init_args"]["test"]["horizon_frames"] == data_shown.TUNED_HORIZON
+    assert [data_shown.shorter_tests(n, 90) for n in (0, 32, 121, 122)] == [
+        "",
+        "",
+        " --data.test.horizon_frames 89",
+        "",
+    ]
     short = ["data", "fake", "bvh", str(tmp_path / "dl"), "--takes", "4", "--frames", "60"]
     assert cli.main(short) == 0
     words = ["--root", str(tmp_path / "dl"), "--workers", "1", str(tmp_path / "store")]
@@ -363,10 +378,10 @@ def test_a_couple_that_was_exported_is_prepared_as_one_scene_of_two(name, out, t
 
 @pytest.mark.parametrize("name", ["bvh", "scenes", "cmu", "remocap"])
 def test_the_shipped_model_is_proposed_for_every_store_of_its_body(name, capsys):
-    tuned, usual = data.training_commands(name, "a store", "open", 300)
+    tuned, usual = data_shown.training_commands(name, "a store", "open", 300)
     assert tuned.startswith("magnet fit --config configs/finetune.yaml --data.path 'a store'   # the shipped model")
     assert usual == f"{registry.fit_command(registry.data_of(registry.reader(name)))} --data.path 'a store'"
-    (usual,) = data.training_commands(name, "store", "SMPLX.npz", 300)
+    (usual,) = data_shown.training_commands(name, "store", "SMPLX.npz", 300)
     assert usual.endswith(" --data.path store --data.body_model SMPLX.npz")
     assert (
         cli.main(["data", "list", name]) == 0 and "configs/finetune.yaml --data.path STORE" in capsys.readouterr().out
