@@ -1,4 +1,4 @@
-"""A part of a file's frames, which `--start` and `--end` choose."""
+"""A part of a file's frames, which `--start` and `--end` choose, and files of several frame rates."""
 
 from __future__ import annotations
 
@@ -33,3 +33,13 @@ def require_one_clock(paths: Sequence[Path], rates: Sequence[float], start: int,
     if (start or end is not None) and len(set(rates)) > 1:
         each = ", ".join(f"{path} {rate:g} fps" for path, rate in zip(paths, rates, strict=True))
         raise ValueError(f"frame rates differ: {each}; --start and --end count frames, so cut each with magnet export")
+
+
+def rates_note(rates: Sequence[float], fps: float) -> list[str]:
+    """A note that files of several rates were resampled; none where all have one.
+
+    >>> rates_note([120.0, 30.0, 120.0], 30.0)
+    ['files of 30 and 120 frames a second, all brought to 30']
+    """
+    different = list(dict.fromkeys(f"{rate:g}" for rate in sorted(rates)))
+    return [f"files of {' and '.join(different)} frames a second, all brought to {fps:g}"] * (len(different) > 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_flag, require_number, require_whole
+from magnet.export.cutting import rates_note
 from magnet.export.formats import MOST_FPS, WRITTEN
 from magnet.export.npz_files import is_ours, read_people
 from magnet.export.retarget import load_rigs, together
@@ -107,7 +108,7 @@ def read(
             raise ValueError(f"in_fps: is for .npz files that say no frame rate; {said}")
         told = {name: value for name, value in vars(options).items() if name != "in_fps"}
         imported = load_rigs(files, body, **told)
-        notes = [str(source) for source in imported.sources]
+        notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
         if abs(imported.floor) >= UNSEEN:
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
             notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
@@ -125,6 +126,7 @@ def read(
             raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
     labels = [str(file) for file in files]
     scene = together(scenes, labels, fps=options.fps, trim=options.trim)
+    notes += rates_note([one.fps for one in scenes], scene.fps)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
 
 

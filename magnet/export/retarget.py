@@ -100,6 +100,7 @@ class Imported:
     scene: Scene
     sources: tuple[Source, ...]
     floor: float  # metres that everybody was lowered by, so that resting feet stand on y = 0
+    rates: tuple[float, ...] = ()  # frames a second of each file
 
 
 def load_rigs(
@@ -166,7 +167,8 @@ def load_rigs(
         T_world_root = scene.T_world_root.clone()
         T_world_root[..., 1, 3] -= floor
         scene = scene.replace(T_world_root=T_world_root)
-    return Imported(scene.replace(names=(" + ".join(path.stem for path in each),)), sources, floor)
+    named = scene.replace(names=(" + ".join(path.stem for path in each),))
+    return Imported(named, sources, floor, tuple(file.fps for file in files))
 
 
 def onto(

@@ -52,7 +52,10 @@ def test_files_of_two_rates_have_no_part_in_common(suffix: str, duet: Scene, bod
     written += formats.write(one.replace(fps=60.0), tmp_path / f"b{suffix}", body)
     with pytest.raises(ValueError, match="--start and --end count frames, so cut each with magnet export"):
         reading.read(written, options=reading.Reading(start=2, fps=30.0, trim=True))
-    assert reading.read(written, options=reading.Reading(fps=30.0, trim=True)).scene.agents == 2
+    got = reading.read(written, options=reading.Reading(fps=30.0, trim=True))
+    said = "files of 30 and 60 frames a second, all brought to 30"
+    assert got.scene.agents == 2 and got.notes.count(said) == 1
+    assert not any("brought" in note for note in reading.read(written[:1] * 2, options=reading.Reading(fps=20.0)).notes)
 
 
 def test_several_npz_are_several_people(duet: Scene, body: Body, tmp_path: Path):

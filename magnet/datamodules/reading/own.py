@@ -15,6 +15,7 @@ from magnet.datamodules.reading.arrays import hashed_split
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own_files import TABLE, PersonFile, SceneFiles, by_names, by_pattern, by_table, files_of
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
+from magnet.export.cutting import rates_note
 from magnet.motion.scene import FPS
 
 FEW = 4
@@ -272,7 +273,7 @@ class OwnReader(Reader, Generic[T]):
             )
         if len(rates) == 1:
             return tracks
-        notes.append(f"files of {' and '.join(f'{rate:g}' for rate in rates)} frames a second, all brought to {FPS:g}")
+        notes += rates_note(rates, FPS)
         return [track.resampled(FPS) for track in tracks]
 
 
