@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing.convert import (
@@ -171,8 +171,8 @@ def summary_of(reader: Reader) -> list[str]:
     """What a reader says of what it found; where a stranger's fails at that, that it did: no take depends on it."""
     try:
         with named_errors(type(reader), "its summary cannot be made"):
-            lines = reader.summary()
-            return [lines] if isinstance(lines, str) else [str(line) for line in lines]
+            lines: object = reader.summary()  # a stranger's may give anything
+            return [lines] if isinstance(lines, str) else [str(line) for line in cast(Iterable[object], lines)]
     except DataError as error:
         return [str(error)]
 
