@@ -243,7 +243,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
         )
     try:
         config = json.loads((folder / "config.json").read_bytes())
-        whole = config.get("sha256", own := _config_hash(config)) == own
+        whole = config.get("sha256", own := config_hash(config)) == own
         version, parts = int(config["format"]), [(part["file"], part["sha256"]) for part in config["parts"]]
         kept = {name: config[name] for name in ("steps", *KEPT)}
         if not isinstance(kept["hyper_parameters"], dict):
@@ -272,7 +272,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
     }
 
 
-def _config_hash(config: dict[str, Any]) -> str:
+def config_hash(config: dict[str, Any]) -> str:
     """SHA-256 of a config.json without this hash itself."""
     said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()
@@ -308,7 +308,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
             "about": about or {},
         }
         config = json.loads(json.dumps(config, default=str))  # as it will be read
-        text = json.dumps(config | {"sha256": _config_hash(config)}, indent=1) + "\n"
+        text = json.dumps(config | {"sha256": config_hash(config)}, indent=1) + "\n"
         write_whole(aside, "config.json", text.encode(), advice=advice)
         new = [*(part["file"] for part in listed), "config.json"]
         for each in new:  # what is left are renames, which need no space

@@ -4,7 +4,7 @@
 
 Trainings that go on from one model with little data each end somewhere else in the same valley; their mean is often
 better than each (Wortsman et al. 2022, Model soups). One named twice counts twice. What the checkpoints hold beside
-weights is the first one's.
+weights is the first one's, but that of all is recorded where the mean comes from.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from magnet import checkpoints
+from magnet.training import origins
 
 TOKENIZER = "tokenizer."
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config", "magnet_version", "global_step")
@@ -50,6 +51,16 @@ def mean_of(states: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     return made
 
 
+def origin_of(each: dict[Path, dict[str, Any]]) -> origins.Origin:
+    """Where a mean of checkpoints comes from: from all of them, and all data that these saw."""
+    origin = origins.begun(*each)
+    for checkpoint in each.values():
+        for data in origins.data_of(checkpoint):
+            origins.saw(origin, data)
+    bodies = {(checkpoint.get(origins.KEY) or {}).get("body") for checkpoint in each.values()}
+    return origin | ({"body": bodies.pop()} if len(bodies) == 1 and None not in bodies else {})
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Read, average, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -66,6 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
         first = each[given.checkpoints[0]]
         made = {name: first[name] for name in KEPT if name in first}
         made["state_dict"] = mean_of([each[path]["state_dict"] for path in given.checkpoints])
+        made[origins.KEY] = origin_of(each)
     except (OSError, ValueError, KeyError) as error:
         parser.error(str(error).splitlines()[0])
     checkpoints.save(made, given.out)

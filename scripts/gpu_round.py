@@ -19,6 +19,7 @@ from typing import Any
 
 from magnet import checkpoints
 from magnet.cli.child import run_to_its_end
+from magnet.training import origins
 
 ROOT = Path(__file__).resolve().parents[1]
 SAVING = 0.5
@@ -63,7 +64,8 @@ def main(arguments: list[str] | None = None) -> None:
     if code:
         raise SystemExit(code)
     checkpoint = checkpoints.read(run / "checkpoints" / "last.ckpt")
-    folder = checkpoints.write(checkpoint, given.out / "weights", {"steps": int(checkpoint["global_step"])})
+    about = {"steps": int(checkpoint["global_step"]), origins.STARTED: origins.started_from(checkpoint)}
+    folder = checkpoints.write(checkpoint, given.out / "weights", about)
     if (run / "metrics.csv").exists():  # few steps log nothing
         shutil.copy(run / "metrics.csv", given.out / "metrics.csv")
     parts = sorted(folder.glob("*.safetensors"))

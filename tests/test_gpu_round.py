@@ -62,6 +62,7 @@ def test_what_comes_back_is_a_model_in_parts_and_its_curve(tmp_path: Path, monke
         run = Path(after(command, "--out"))
         (run / "checkpoints").mkdir(parents=True)
         model = tiny_denoiser()
+        model.origin = {"started from": [{"name": "duet"}], "data": []}
         checkpoint = {"state_dict": model.state_dict(), "hyper_parameters": dict(model.hparams), "global_step": 7}
         model.on_save_checkpoint(checkpoint)
         torch.save(checkpoint, run / "checkpoints" / "last.ckpt")
@@ -72,7 +73,8 @@ def test_what_comes_back_is_a_model_in_parts_and_its_curve(tmp_path: Path, monke
     script.main(["--steps", "7", "--out", str(tmp_path)])
     assert (tmp_path / "metrics.csv").read_text() == "step\n7\n"
     assert all(part.stat().st_size <= 16_000_000 for part in (tmp_path / "weights").glob("*.safetensors"))
-    assert json.loads((tmp_path / "weights" / "config.json").read_text())["steps"] == 7
+    config = json.loads((tmp_path / "weights" / "config.json").read_text())
+    assert config["steps"] == 7 and config["about"]["started from"] == [{"name": "duet"}]
     assert isinstance(Denoiser.load(tmp_path / "weights"), Denoiser)
 
 

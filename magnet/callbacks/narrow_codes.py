@@ -43,5 +43,6 @@ class NarrowCodes(Callback):
         made, lost = narrowed(wide, scenes, self.size)
         path = Path(kept.dirpath) / NAME
         fields: dict[str, Any] = {"state_dict": made.state_dict(), "hyper_parameters": dict(made.hparams)}
+        pl_module.on_save_checkpoint(fields)  # where its weights come from
         checkpoints.save({**fields, "global_step": trainer.global_step, "magnet_version": __version__}, path)
         rank_zero_info(f"{path}: codes of {self.size} numbers, which leave out {lost:.2%} of the variance of latents")

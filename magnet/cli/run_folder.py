@@ -24,6 +24,7 @@ from magnet.cli.errors import CommandError
 from magnet.cli.pipes import output_closed
 from magnet.cli.provenance import provenance
 from magnet.files import require_place, write_text
+from magnet.training import origins
 from magnet.version import __version__
 
 MONITOR = "val/loss"
@@ -362,7 +363,11 @@ class Record(Callback):
         write_text(self.folder / f"config{own}.yaml", self.config)
         write_text(self.folder / f"run{own}.json", json.dumps(provenance() | self.facts, indent=2) + "\n")
 
-    on_train_start = on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
+    on_validation_batch_end = on_test_batch_end = on_predict_batch_end = _begin
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begin(trainer, pl_module)
+        origins.saw(getattr(pl_module, "origin", None), self.options.get("data"))
 
     def _end(self, *_: Any, **__: Any) -> None:
         link = self.folder.with_name(LATEST)

@@ -22,6 +22,7 @@ from magnet.motion.scene import Scene, all_valid
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
+from magnet.training import origins
 from magnet.training.optim import warmup_cosine
 
 
@@ -50,6 +51,7 @@ class Denoiser(DenoiserCore, TokenModel):
         if not self.normalizer.ready:
             if self.hparams["start_from"]:
                 self.take_over(self.hparams["start_from"])
+            self.origin = origins.begun(self.hparams["start_from"], self.hparams["tokenizer"])
             if not self.normalizer.ready:
                 self._fit_statistics()
         if self.hparams["cuda_graph"] and self.device.type == "cuda":

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import lightning as L
 import torch
 from torch import Tensor
 
+from magnet import checkpoints
 from magnet.body import Body, load_body
 from magnet.denoiser.statistics import token_statistics
 from magnet.denoiser.token_core import TokenModelCore
 from magnet.precision import require_float32_scenes
 from magnet.tokenizer.core import TokenizerCore
+from magnet.training import origins
 
 
 class TokenModel(TokenModelCore, L.LightningModule):
     """Base of networks that are trained to predict motion tokens: `TokenModelCore` as a LightningModule."""
 
     _body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
+    origin: origins.Origin | None = None  # of its weights; None: nobody recorded it
 
     def keep(self, options: dict[str, Any]) -> None:
         # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
@@ -28,6 +32,22 @@ class TokenModel(TokenModelCore, L.LightningModule):
     @property
     def device(self) -> torch.device:
         return super(TokenModelCore, self).device  # Lightning's, which is known before there are parts
+
+    # -- where its weights come from -------------------------------------------------------------
+
+    @classmethod
+    def load(cls, name_or_path: str | Path | None = None) -> Self:
+        model = super().load(name_or_path)
+        model.origin = origins.begun(checkpoints.DEFAULT if name_or_path is None else name_or_path)
+        return model
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        origins.put(self.origin, None if self._trainer is None else self.require_body().id, checkpoint)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self.origin = origins.taken(checkpoint)
 
     # -- before training ------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import lightning as L
 import torch
@@ -27,6 +27,7 @@ from magnet.tokenizer.losses import JOINT_LOSSES, masked_mean, matrices, reconst
 from magnet.tokenizer.quantizer import KMEANS_VECTORS
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_quantizer
+from magnet.training import origins
 from magnet.training.optim import warmup_cosine
 
 __all__ = ["RawPose", "Tokenizer"]
@@ -42,9 +43,17 @@ class Tokenizer(TokenizerCore, L.LightningModule):
     Options are those of `TokenizerCore`.
     """
 
+    origin: origins.Origin | None = None  # of its weights; None: nobody recorded it
+
     def keep(self, options: dict[str, Any]) -> None:
         # As a dictionary: inside a command line that builds another module, Lightning would store that one's fields.
         self.save_hyperparameters(options)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        tokenizer = super().load(path)
+        tokenizer.origin = origins.begun(path)
+        return tokenizer
 
     # -- start ---------------------------------------------------------------------------------
 
@@ -93,8 +102,10 @@ class Tokenizer(TokenizerCore, L.LightningModule):
         return bool(self.quantizer.initialized) and bool(self.vqvae.pose.ready)
 
     def on_fit_start(self) -> None:
-        if self.hparams["start_from"] and not self._initialized:
-            self.take_weights(self.hparams["start_from"])
+        if not self._initialized:
+            if self.hparams["start_from"]:
+                self.take_weights(self.hparams["start_from"])
+            self.origin = origins.begun(self.hparams["start_from"])
         if self.hparams["decoder_only"]:
             if not self._initialized:
                 raise ValueError("decoder_only: there are no codes to decode yet; give start_from a trained tokenizer")
@@ -234,3 +245,7 @@ class Tokenizer(TokenizerCore, L.LightningModule):
                 "not a tokenizer's checkpoint, it holds a denoiser; --model.start_from takes over the tokenizer in one"
             )
         check_fields(checkpoint.get("hyper_parameters", {}), self.hparams)
+        self.origin = origins.taken(checkpoint)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        origins.put(self.origin, None if self.body is None else self.body.id, checkpoint)

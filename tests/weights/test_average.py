@@ -11,6 +11,7 @@ from torch import Tensor
 from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
+from magnet.training import origins
 from tests.scripts import module_at
 
 average = module_at(Path(__file__).resolve().parents[2] / "scripts" / "average_weights.py")
@@ -41,6 +42,24 @@ def test_the_mean_is_a_model_half_way_with_the_same_tokenizer(tmp_path: Path) ->
     torch.testing.assert_close(weight(made), weight(first) + 1.0)
     for name, value in first.tokenizer.state_dict().items():
         assert torch.equal(value, made.tokenizer.state_dict()[name]), name
+
+
+def test_a_mean_says_what_went_into_it_and_all_data_that_these_saw(tmp_path: Path) -> None:
+    places = []
+    for name, data in (("a", {"class_path": "Mine"}), ("b", {"class_path": "Theirs"})):
+        model = moved(tiny_denoiser(), 1.0 if name == "a" else 2.0)
+        model.origin = {origins.STARTED: [{"name": "first.ckpt", "sha256": "0"}], "data": [data]}
+        places.append(saved(model, tmp_path / f"{name}.ckpt"))
+    average.main([str(tmp_path / "mean.ckpt"), *map(str, [*places, places[0]])])
+    said = checkpoints.read(tmp_path / "mean.ckpt")[origins.KEY]
+    assert [each["name"] for each in said[origins.STARTED]] == ["a.ckpt", "b.ckpt", "first.ckpt"]
+    assert said["data"] == [{"class_path": "Mine"}, {"class_path": "Theirs"}] and "body" not in said
+    for place in places:
+        checkpoint = checkpoints.read(place)
+        checkpoint[origins.KEY]["body"] = "open-1"
+        checkpoints.save(checkpoint, place)
+    average.main([str(tmp_path / "mean.ckpt"), *map(str, places), "--overwrite"])
+    assert checkpoints.read(tmp_path / "mean.ckpt")[origins.KEY]["body"] == "open-1"
 
 
 def test_models_of_other_sizes_have_no_mean() -> None:
