@@ -239,8 +239,8 @@ def train(given: Any, out: Path, steps: dict[str, int]) -> None:
             raise SystemExit(f"{stage} was stopped; run the same command again to go on from its last checkpoint")
     average(out, "released", RELEASED)
     released = mean_checkpoint(out, "released")
-    release = [sys.executable, str(ROOT / "scripts" / "release_weights.py"), str(released)]
-    release += [given.name, "--decoder", str(last_checkpoint(out / "decoder"))]
+    release = [sys.executable, "-m", "magnet", "release", str(released), given.name]
+    release += ["--decoder", str(last_checkpoint(out / "decoder"))]
     release += ["--folder", str(folder)]
     run(release, "release")
     weights = shlex.quote(str(folder / given.name))

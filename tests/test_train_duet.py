@@ -14,6 +14,7 @@ import torch
 
 from magnet import checkpoints
 from magnet.cli import child
+from magnet.cli.release_record import TRAINED_ON
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
 from tests.scripts import module_at
@@ -92,7 +93,8 @@ def test_what_has_its_steps_is_not_run_again_and_a_failure_ends_it(tmp_path: Pat
         if stage != "released":  # right before the stage that begins from it
             assert str(tmp_path / stage) in ran[ran.index(command) + 1]
     released = str(recipe.mean_checkpoint(tmp_path, "released"))
-    assert released in ran[-1] and "release_weights.py" in ran[-1][1] and str(tmp_path / "weights") in ran[-1]
+    assert ran[-1][1:6] == ["-m", "magnet", "release", released, "duet"] and str(tmp_path / "weights") in ran[-1]
+    assert ran[-1][ran[-1].index("--decoder") + 1] == str(recipe.last_checkpoint(tmp_path / "decoder"))
     assert "tokenizer: has its 3 steps already" in capsys.readouterr().out
     monkeypatch.undo()
     with pytest.raises(SystemExit, match="run the same command again"):
@@ -208,3 +210,6 @@ def test_it_runs_from_recordings_to_weights_and_goes_on_where_it_stood(
     name = next(name for name in decoder if "decoder" in name and decoder[name].dim() == 1)
     assert torch.equal(released[f"tokenizer.{name}"], decoder[name])
     assert model.normalizer.ready
+    about = json.loads((tmp_path / "weights" / "duet" / "config.json").read_text(encoding="utf-8"))["about"]
+    assert about["trained on"] == TRAINED_ON and about["licence"] == "Apache-2.0" and about["body"] == "open-1"
+    assert "narrow.ckpt" in [each["name"] for each in about["started from"]]

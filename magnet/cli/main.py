@@ -36,6 +36,7 @@ LIGHT_COMMANDS = {
     "report": "the paper's tables, run here beside the printed numbers",
     "export": "write scenes as bvh, glb, csv, npz, html or a picture",
     "export-model": "write a model as ONNX files, for programs without torch",
+    "release": "make a folder of a trained model that can be passed on, with what is known of its weights",
     "doctor": "what is installed, what is missing and what to do about it",
 }
 COMMANDS = TRAINER_COMMANDS | LIGHT_COMMANDS

@@ -10,7 +10,6 @@ import torch
 from magnet import checkpoints
 from magnet.files import CannotWrite
 from magnet.training.checkpoint_io import CheckpointIO
-from tests.scripts import module_at
 
 
 @pytest.fixture
@@ -150,44 +149,3 @@ def test_an_unknown_name_says_which_there_are():
 def test_what_the_command_calls_checkpoints_of_its_folder_is_told_how_to_be_named(name: str):
     with pytest.raises(ValueError, match=rf"^no checkpoint {name}: .*; give a run's folder, such as runs/NAME/latest"):
         checkpoints.resolve(name)
-
-
-def test_a_decoder_that_went_on_alone_replaces_the_old_one_and_no_other(checkpoint):
-    names = ("vqvae.encoder.a", "vqvae.decoder.b", "vqvae.pose.mean", "quantizer.codes", "quantizer.ema_count")
-    old = {name: torch.randn(3) for name in names}
-    checkpoint["state_dict"] |= {f"tokenizer.{name}": value for name, value in old.items()}
-    new = {"vqvae.decoder.b": torch.randn(3), "quantizer.ema_count": torch.randn(3)}
-    tokenizer = {"state_dict": old | new, "hyper_parameters": {"decoder_only": True}}
-    with_decoder = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").with_decoder
-    state = with_decoder(checkpoint, tokenizer)["state_dict"]
-    changed = [name for name, value in state.items() if not torch.equal(checkpoint["state_dict"][name], value)]
-    assert changed == ["tokenizer.vqvae.decoder.b"]
-    for name in ("vqvae.encoder.a", "vqvae.pose.mean", "quantizer.codes"):
-        other = tokenizer["state_dict"] | {name: torch.randn(3)}
-        with pytest.raises(ValueError, match=f"other codes than the denoiser's: {name}"):
-            with_decoder(checkpoint, tokenizer | {"state_dict": other})
-
-
-def test_how_a_decoder_was_trained_is_kept_with_it_and_with_no_other(checkpoint, tmp_path: Path) -> None:
-    kept = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").decoder_kept
-    name = "tokenizer.vqvae.decoder.b"
-    checkpoint["state_dict"][name] = torch.randn(3, 3)
-    assert kept(checkpoint["state_dict"], tmp_path / "new") == {}
-    about = {"decoder run": {"command": "magnet fit"}}
-    released = checkpoints.write(checkpoint, tmp_path / "old", about)
-    assert kept(checkpoint["state_dict"], released) == about
-    assert kept(checkpoint["state_dict"] | {name: torch.randn(3, 3)}, released) == {}
-    assert kept(checkpoint["state_dict"], checkpoints.write(checkpoint, tmp_path / "none")) == {}
-
-
-def test_what_weights_were_trained_on_is_only_told_of_the_data_that_it_is_known_of() -> None:
-    ours = module_at(Path(__file__).parents[2] / "scripts/release_weights.py").ours
-    cmu = {"class_path": "magnet.datamodules.CMU", "init_args": {"test_takes": [5, 10, 15], "val_takes": [3]}}
-    synthetic = {"class_path": "magnet.datamodules.Synthetic", "init_args": {}}
-    others = {"class_path": "magnet.datamodules.reshaped.Reshaped", "init_args": {"data": [cmu]}}
-    mixed = {"class_path": "magnet.datamodules.Mixed", "init_args": {"data": [cmu, others, synthetic]}}
-    assert all(map(ours, (cmu, synthetic, others, mixed)))
-    taken = {**cmu, "init_args": {"test_takes": [5], "val_takes": [3]}}
-    store = {**cmu, "init_args": {**cmu["init_args"], "path": "store"}}
-    duobox = {"class_path": "magnet.datamodules.DuoBox", "init_args": {"path": "store"}}
-    assert not any(map(ours, (taken, store, duobox, [cmu, duobox], None, {})))
