@@ -72,6 +72,9 @@ def test_a_tokenizer_records_what_it_started_from(tmp_path: Path) -> None:
         fitted(model, 1).save_checkpoint(tmp_path / "made.ckpt")
         said = origin(tmp_path / "made.ckpt")
         assert [each["name"] for each in said[origins.STARTED]] == names and said["body"] == "open-1"
+        again = Tokenizer(**fields)  # which goes on, and did not start anew
+        fitted(again, 2, str(tmp_path / "made.ckpt")).save_checkpoint(tmp_path / "again.ckpt")
+        assert origin(tmp_path / "again.ckpt") == said
 
 
 def test_a_checkpoint_of_an_earlier_version_goes_on_without_saying_more_than_is_known(tmp_path: Path) -> None:
@@ -100,3 +103,9 @@ def test_a_released_model_passes_on_what_it_says_of_itself(first: Path, tmp_path
     assert behind == {"name": "a"}
     assert origins.begun(folder, "raw", None, folder)[origins.STARTED] == [own, behind]  # each once
     assert origins.sources("no_such_file.ckpt") == [{"name": "no_such_file.ckpt"}]
+
+
+def test_a_model_of_a_hub_keeps_its_name_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoints, "from_hub", lambda name: checkpoints.FOLDER / "duet")
+    name = "hub:somebody/model@v1"
+    assert origins.sources(name)[0] == {**origins.sources("duet")[0], "name": name}
