@@ -21,7 +21,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_folder, run_folder, run_logs
+from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_folder, run_folder, run_logs, run_record
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
@@ -304,15 +304,15 @@ class MagnetCLI(LightningCLI):
         own = self.checkpoint is not None and self.folder.resolve() in self.checkpoint.resolve().parents
         return self.command == "fit" and own
 
-    def _record(self) -> run_folder.Record:
+    def _record(self) -> run_record.Record:
         self._dump_config()
         options = {key: self.config_dump.get(key) for key in ("model", "data")}
         settings = run_folder.with_checkpoint(self.config[self.command], self.command, self.checkpoint)
         config = self._parser(self.command).dump(settings, skip_none=False)
-        facts = run_folder.seeds(self.config_dump)
+        facts = run_record.seeds(self.config_dump)
         facts["checkpoint"] = None if self.checkpoint is None else str(self.checkpoint)
         latest = self._option("out") is None
-        return run_folder.Record(self.folder, config, options, facts, latest, self._goes_on, self.command)
+        return run_record.Record(self.folder, config, options, facts, latest, self._goes_on, self.command)
 
     def _option(self, name: str) -> Any:
         return self.config[self.command].get(name)

@@ -8,12 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from magnet import cli
-from magnet.cli import doctor, run_folder
-from magnet.files import CannotWrite
+from magnet.cli import run_folder
 from tests.toys import ToyData, ToyModel
 
 FLAGS = {
@@ -83,13 +82,6 @@ def test_the_first_process_is_known_whoever_started_it(
     assert run_folder.first_process() == first
 
 
-def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    record = run_folder.Record(tmp_path / "file" / "run", "", {}, {}, command="test")
-    with pytest.raises(CannotWrite, match="is a file, expected a folder"):
-        record.setup(Trainer(logger=False, accelerator="cpu"), LightningModule(), "test")
-
-
 def test_the_best_checkpoint_stays_beside_a_users_own(tmp_path: Path) -> None:
     """Also beside one that measures the same, whose state Lightning must tell apart, but not beside its best.ckpt."""
     model = ToyModel()
@@ -142,21 +134,3 @@ def test_a_training_without_a_validation_says_why_it_has_no_best_checkpoint(
     assert cli.main(["fit", *words[:-1], "other", "--trainer.max_steps", "3"]) == 0
     said = capsys.readouterr()
     assert "its best checkpoint: " in said.out and "no best.ckpt" not in said.out
-
-
-@pytest.mark.parametrize("command", ["validate", "test", "predict"])
-def test_latest_leads_to_what_was_measured_last_but_a_trainings_stays(command: str, toy: Path) -> None:
-    (toy / "salsa.yaml").write_text("model: {class_path: ToyModel}\n")
-    words = ["--trainer.accelerator", "cpu", "--ckpt_path", "last"]
-    assert cli.main(["fit", "--config", "salsa.yaml", "--trainer.max_epochs", "1", *words[:2]]) == 0
-    trained = (toy / "runs" / "salsa" / "latest").resolve()
-    latest = toy / "runs" / command / "latest"
-    for number in (1, 2):
-        assert cli.main([command, *words]) == 0
-        runs = [path for path in latest.parent.iterdir() if not path.is_symlink()]
-        assert len(runs) == number and latest.resolve() == max(runs, key=lambda run: run.stat().st_mtime_ns)
-    assert cli.main([command, *words, "--out", "elsewhere"]) == 0 and not (toy / "latest").exists()
-    assert cli.main([command, "--config", "salsa.yaml", *words]) == 0
-    assert (toy / "runs" / "salsa" / "latest").resolve() == trained
-    (told,) = (one.told for one in doctor.files() if one.what == "runs")
-    assert ", 4 runs, " in told, "links are no runs"

@@ -16,7 +16,7 @@ import yaml
 from lightning.pytorch.trainer.connectors import checkpoint_connector
 
 from magnet import cli
-from magnet.cli import run_folder, train
+from magnet.cli import train
 from magnet.training.checkpoint_io import CheckpointIO
 from tests.toys import OtherData, ToyData, ToyEvaluator, ToyModel, play
 
@@ -222,16 +222,6 @@ def test_samples_follow_the_seed_that_was_said_last(
     facts = json.loads((toy / "made" / "run.json").read_text())
     assert facts["seed"] == facts["seeds"]["seed"] == ToyModel.seen["evaluator"].seed == seed
     assert yaml.safe_load((toy / "made" / "config.yaml").read_text())["seed"] == seed
-
-
-def test_seeds_of_model_and_data_are_recorded_by_their_names() -> None:
-    of = {"class_path": "its.Class", "init_args": {"seed": 3}}
-    fit = run_folder.seeds({"seed_everything": 1111, "model": of, "data": {"class_path": "its.Data"}})
-    assert fit == {"seed": 1111, "seeds": {"seed_everything": 1111, "model.seed": 3}}
-    assert run_folder.seeds({"seed": 5, "seed_everything": 1, "model": None, "data": of}) == {
-        "seed": 5,
-        "seeds": {"seed": 5, "seed_everything": 1, "data.seed": 3},
-    }
 
 
 def test_the_configuration_of_a_run_repeats_it(trained: Path) -> None:
