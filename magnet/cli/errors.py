@@ -39,6 +39,8 @@ def explain(error: Exception) -> str | None:
             "another process of this training has ended, and so does this one; its own log says why. To go on from "
             "the last checkpoint, run the same command with --ckpt_path last (--debug shows where)"
         )
+    if isinstance(error, KeyError) and "Trying to restore optimizer state" in text:  # Lightning's
+        return weights_alone()
     if isinstance(error, ImportError) and "pip install" in text:
         return text
     if isinstance(error, OSError) and error.errno in FULL and error.args[:1] == (error.errno,):
@@ -48,6 +50,14 @@ def explain(error: Exception) -> str | None:
         said = re.findall(r"^ *- (?!Expected )(.+)", text, re.MULTILINE) if text.startswith(UNION) else []
         return f"{said[0] if said else text or type(error).__name__} (--debug shows where)"
     return None
+
+
+def weights_alone(checkpoint: object = None) -> str:
+    """What is said where a training is to go on from a checkpoint that holds none; None: from whichever."""
+    return (
+        f"{checkpoint or 'the checkpoint'} holds weights, and no state of a training to go on with: begin a new run "
+        f"from them, with --model.start_from {checkpoint or 'NAME'} in place of --ckpt_path"
+    )
 
 
 def misfit(text: str) -> str:

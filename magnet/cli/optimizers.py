@@ -8,9 +8,10 @@ from typing import Any
 from jsonargparse import Namespace
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, instantiate_class
+from lightning.pytorch.trainer.states import TrainerFn
 from torch.optim import Optimizer
 
-from magnet.cli.errors import CommandError
+from magnet.cli.errors import CommandError, weights_alone
 
 KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
 """Options, and what a model does without them (`magnet.training.optim`)."""
@@ -83,7 +84,7 @@ def optimizer_of(configured: Any) -> Optimizer:
 
 
 class SameOptimizer(Callback):
-    """Writes into checkpoints which optimizer trained, and refuses to go on with another one.
+    """Writes into checkpoints which optimizer trained, and refuses to go on with another one, or without its state.
 
     Args:
         checkpoint: the file, for messages.
@@ -97,6 +98,8 @@ class SameOptimizer(Callback):
         checkpoint[MADE_WITH] = [type(optimizer).__name__ for optimizer in trainer.optimizers]
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        if not checkpoint.get("optimizer_states") and trainer.state.fn == TrainerFn.FITTING:
+            raise CommandError(weights_alone(self.checkpoint))
         self.before = made_with(checkpoint)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -73,3 +73,23 @@ def test_an_optimizer_is_found_in_whatever_is_configured() -> None:
         optimizer_of([optimizer, optimizer])
     with pytest.raises(ValueError, match="NoneType"):
         optimizer_of(None)
+
+
+def test_weights_without_a_trainings_state_are_told_how_to_be_begun_from(
+    toy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained("--out", "run")
+    state = torch.load("run/checkpoints/last.ckpt", weights_only=False)
+    torch.save({**state, "optimizer_states": [], "lr_schedulers": []}, "weights.ckpt")
+    assert cli.main(["fit", "--model", "ToyModel", *QUIET, "--ckpt_path", "weights.ckpt"]) == 2
+    said = capsys.readouterr().err
+    assert "weights.ckpt holds weights, and no state of a training to go on with" in said
+    assert "--model.start_from weights.ckpt in place of --ckpt_path" in said
+
+
+def test_a_released_model_is_told_so_too(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trained("--out", "run")
+    state = torch.load("run/checkpoints/last.ckpt", weights_only=False)
+    torch.save({key: state[key] for key in ("state_dict", "hyper_parameters", "pytorch-lightning_version")}, "w.ckpt")
+    assert cli.main(["fit", "--model", "ToyModel", *QUIET, "--ckpt_path", "w.ckpt"]) == 2
+    assert "holds weights, and no state of a training to go on with" in capsys.readouterr().err
