@@ -32,6 +32,7 @@ BUILT_IN = (
     "hi4d",
     "chi3d",
     "bvh",
+    "glb",
     "scenes",
 )
 """Our modules, in the order in which they are listed; the first one's data set is the default."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported, without_gaps
 from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
-from magnet.datamodules.reading.own import OwnReader
+from magnet.datamodules.reading.own import OwnReader, require_alone
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
 from magnet.datamodules.registry import register_reader
@@ -144,11 +144,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         tracks = [track for where, one in people for track in self._tracks(where, one, notes)]
         if len(people) > 1:
             one_length(path, {where: track.frames for (where, _), track in zip(people, tracks, strict=True)})
-        if len(tracks) > 1 and not alone:
-            raise DataError(
-                f"{path}: holds {len(tracks)} people, but other files belong to its scene, too; of several files each "
-                "holds one person: rename it, or put it elsewhere"
-            )
+        require_alone(path, len(tracks), alone)
         return tracks, notes
 
     def _tracks(self, where: str, held: Mapping[str, Any], notes: list[str]) -> Iterator[PosedTrack]:

@@ -46,11 +46,11 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ValueError: more than one scene, nobody present, no frames, or another body's.
     """
     slots = slots_to_write(scene, body)
-    gltf = _Gltf()
+    gltf = Gltf()
     skin = gltf.skin_of(body)
     times = gltf.accessor(frame_times(scene.frames, scene.fps), FLOAT, "SCALAR", bounds=True)
     shaped: dict[bytes, dict[str, int]] = {}
-    scene_clip = _animation("motion")
+    scene_clip = animation("motion")
     for slot in slots:
         betas = scene.betas[0, slot].detach().cpu().float()
         shape = shaped.setdefault(betas.numpy().tobytes(), {})
@@ -58,7 +58,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
             shape |= gltf.shape_of(body, betas)
         pelvis, floor = gltf.person(slot, standing(body, betas), {**skin, **shape}, bones)
         T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu()
-        clip = scene_clip if bones.clips == "scene" else _animation(f"person_{slot}")
+        clip = scene_clip if bones.clips == "scene" else animation(f"person_{slot}")
         if floor is not None:
             T_world_floor = canonical_frame(T_above_pelvis)
             T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
@@ -97,7 +97,8 @@ def frame_times(frames: int, fps: float) -> NDArray[np.float32]:
     return np.where(short, np.nextafter(times, np.float32(np.inf)), times)
 
 
-def _animation(name: str) -> dict[str, Any]:
+def animation(name: str) -> dict[str, Any]:
+    """An animation of nothing yet."""
     return {"name": name, "samplers": [], "channels": []}
 
 
@@ -122,7 +123,7 @@ def _raised(vertices: Tensor) -> Tensor:
     return torch.tensor([0.0, -float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
 
 
-class _Gltf:
+class Gltf:
     """A glTF document and its one binary buffer, grown part by part."""
 
     def __init__(self) -> None:
@@ -233,22 +234,21 @@ class _Gltf:
         self.document["scenes"][0]["nodes"] += [group, self.add("nodes", body)]
         return pelvis, floor
 
-    def animate(self, animation: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
+    def animate(self, clip: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
         """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""
         quaternions = unbroken(to_quat(local.double()))
         tracks = [("translation", first, self.accessor(place.numpy(), FLOAT, "VEC3"))]
         for j in range(local.shape[1]):
             tracks.append(("rotation", first + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))
         for what, node, output in tracks:
-            animation["channels"].append(
-                {"sampler": len(animation["samplers"]), "target": {"node": node, "path": what}}
-            )
-            animation["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
+            clip["channels"].append({"sampler": len(clip["samplers"]), "target": {"node": node, "path": what}})
+            clip["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
 
     def packed(self) -> bytes:
         """The file: header, JSON padded with spaces, buffer padded with zeros."""
         self.document["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.document, separators=(",", ":")).encode()
+        held = {key: value for key, value in self.document.items() if value != []}  # glTF has no empty lists
+        text = json.dumps(held, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + len(self.binary)
         head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")

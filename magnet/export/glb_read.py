@@ -138,11 +138,18 @@ def _tracks(file: GltfFile) -> tuple[Tracks, list[str]]:
         taken |= dict.fromkeys(nodes, name)
         for channel in channels:
             if "node" in channel["target"]:
-                sampler = animation["samplers"][channel["sampler"]]
-                keys, values = file.numbers(sampler["input"])[:, 0], file.numbers(sampler["output"])
-                how = sampler.get("interpolation", "LINEAR")
-                tracks[channel["target"]["node"], channel["target"]["path"]] = Track(keys, values, how)
+                what = channel["target"]["path"]
+                tracks[channel["target"]["node"], what] = _track(file, animation["samplers"][channel["sampler"]], what)
     return tracks, left
+
+
+def _track(file: GltfFile, sampler: dict[str, Any], what: str) -> Track:
+    keys, values = file.numbers(sampler["input"])[:, 0], file.numbers(sampler["output"])
+    if not len(keys):
+        raise ValueError(f"a {what} has no frames: export it again")
+    if values.shape[1] != len(DEFAULTS[what]):
+        raise ValueError(f"a {what} has {values.shape[1]} numbers, expected {len(DEFAULTS[what])}: export it again")
+    return Track(keys, values, sampler.get("interpolation", "LINEAR"))
 
 
 def _clock(tracks: Sequence[Track]) -> tuple[Floats, float, list[str]]:

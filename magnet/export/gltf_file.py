@@ -71,7 +71,8 @@ class GltfFile:
             values = np.ndarray((accessor["count"], width), kind, data, begin, (stride, kind.itemsize))
         except (ValueError, TypeError) as error:
             raise IndexError(f"numbers {index} lie outside the file") from error
-        values = values.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # NaN of another kind: it is refused below
+            values = values.astype(np.float64)
         if accessor.get("normalized"):
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         if not np.isfinite(values).all():

@@ -20,16 +20,18 @@ from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.reading.recording import Take
 from tests.cases import some_quick
 from tests.datamodules.readers import Foreign, cut, fake_of
+from tests.export.glb_strangers import Written
+from tests.export.glb_strangers import opened as opened_glb
 
 Damage = Callable[[Take], Any]
 SAID = {
-    "truncated": r"cut short|not a whole pickle|not an npz archive|the file is truncated",
+    "truncated": r"cut short|not a whole pickle|not an npz archive|the file is truncated|not a whole .glb file",
     "partner missing": r"partner|no such file|expected two people",
-    "unequal lengths": r"unequal numbers of frames|people and frames are|frame \d+ is missing",
+    "unequal lengths": r"unequal numbers of frames|people and frames are|frame \d+ is missing|do not go together",
     "NaN": r"NaN",
     "zero frames": r"no frames|has no rows|says 0 frames|: 0 frames of",
     "betas absent": r"lacks betas|betas/.*no such file",
-    "wrong shape": r"got shape \(|smpl_poses are \(|columns, expected|headings over|its header is wrong",
+    "wrong shape": r"got shape \(|smpl_poses are \(|(columns|numbers), expected|headings over|its header is wrong",
     "foreign code": r"a pickle can run code|holds pickled objects|Object arrays cannot be loaded",
 }
 """Every kind of bad input, and what is said of it, besides the file's name."""
@@ -210,6 +212,36 @@ BVH: dict[str, Damage] = {
     "zero frames": text(r"Frames: \d+", "Frames: 0"),
     "wrong shape": text(r"CHANNELS 3 \S+ ", "CHANNELS 2 "),
 }
+
+
+def document(change: Callable[[Written], Any]) -> Damage:
+    """GLB: another document, or other numbers in the file."""
+
+    def damage(take: Take) -> None:
+        glb = opened_glb(take.files[0])
+        change(glb)
+        glb.save(take.files[0])
+
+    return damage
+
+
+def of_quaternions(glb: Written, **said: Any) -> None:
+    """Other things said of all that has four numbers."""
+    for each in glb.document["accessors"]:
+        each.update(said if each["type"] == "VEC4" else {})
+
+
+def last_number(glb: Written) -> None:
+    glb.binary = glb.binary[:-4] + np.float32(np.nan).tobytes()
+
+
+GLB: dict[str, Damage] = {
+    "truncated": lambda take: cut(take.files[0]),
+    "NaN": document(last_number),
+    "zero frames": document(lambda glb: [each.update(count=0) for each in glb.document["accessors"]]),
+    "wrong shape": document(lambda glb: of_quaternions(glb, type="VEC3")),
+    "unequal lengths": document(lambda glb: of_quaternions(glb, count=7)),
+}
 AMASS = Layout("trans", "poses").damages()
 SCENES: dict[str, Damage] = {
     **{kind: AMASS[kind] for kind in ("unequal lengths", "NaN", "zero frames")},
@@ -233,15 +265,16 @@ DAMAGES: dict[str, dict[str, Damage]] = {
     "hi4d": HI4D,
     "chi3d": Layout("transl", "body_pose", axis=1, partner=first_person_only("transl"), foreign=False).damages(),
     "bvh": BVH,
+    "glb": GLB,
     "scenes": SCENES,
 }
 LACKING = {
     ("aioz", "betas absent"), ("remocap", "betas absent"), ("chi3d", "foreign code"), ("bvh", "betas absent"),
-    ("bvh", "foreign code"), ("bvh", "partner missing"), ("bvh", "unequal lengths"), ("scenes", "betas absent"),
-    ("scenes", "partner missing"),
+    ("bvh", "foreign code"), ("bvh", "partner missing"), ("bvh", "unequal lengths"), ("glb", "betas absent"),
+    ("glb", "foreign code"), ("glb", "partner missing"), ("scenes", "betas absent"), ("scenes", "partner missing"),
 }  # fmt: skip
-"""What cannot be done or is no mistake: AIOZ has no betas and a user's files need none, json and BVH hold no code, and
-in a user's folder anybody may be alone, or beside somebody who was recorded longer."""
+"""What cannot be done or is no mistake: AIOZ has no betas and a user's files need none, json, BVH and GLB hold no code,
+and in a user's folder anybody may be alone, or beside somebody who was recorded longer."""
 
 
 def test_every_kind_of_bad_input_is_tried_on_every_data_set() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from magnet.body import load_body
-from magnet.datamodules.bvh import BVHReader, read_joints
+from magnet.datamodules.bvh import BVHReader
 from magnet.datamodules.fakes.bvh import named, write_scenes
 from magnet.datamodules.fakes.motion import FakeMotion, people, turned
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
@@ -19,6 +19,7 @@ from magnet.datamodules.preparing.convert import convert
 from magnet.datamodules.reading.own import FEW
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import DataError, Reader
+from magnet.datamodules.reading.rigs import read_joints
 from magnet.export.bvh import save_bvh
 from magnet.motion.rotations import from_rotvec
 from magnet.synthesis import synthesize

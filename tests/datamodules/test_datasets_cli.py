@@ -22,7 +22,7 @@ SMALL = {
     "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
     "test.context_frames": "8", "test.horizon_frames": "8", "test.limit": "2",
 }  # fmt: skip
-FRAMES = {"remocap": 40, "bvh": 40, "cmu": 40}
+FRAMES = {"remocap": 40, "bvh": 40, "glb": 40, "cmu": 40}
 """Of a fake's takes, where fitting 150 takes too long."""
 QUICK = ("interx",)
 """One that needs a body and one that brings its own; the others' files are read in test_readers.py."""

@@ -44,6 +44,15 @@ class Written:
         return path
 
 
+def opened(path: Path) -> Written:
+    """A file to go on with."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    glb = Written()
+    glb.document, glb.binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    return glb
+
+
 def parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
     """Translation, quaternion and scale of a transform (..., 4, 4)."""
     scale = np.linalg.norm(matrix[..., :3, :3], axis=-2)

@@ -112,7 +112,7 @@ def test_keys_that_are_left_out_where_nothing_changes_leave_the_rate(duet: Scene
 
 def test_hair_on_a_head_is_nobody_and_a_second_animation_is_told(duet: Scene, body: Body, tmp_path: Path) -> None:
     path = stranger(duet, body, tmp_path / "a.glb")
-    glb = opened(path)
+    glb = glb_strangers.opened(path)
     head = next(k for k, node in enumerate(glb.document["nodes"]) if node["name"] == "head")
     hair = glb.add("nodes", {"name": "hair", "translation": [0, 0.1, 0]})
     glb.document["nodes"][head]["children"].append(hair)
@@ -123,20 +123,11 @@ def test_hair_on_a_head_is_nobody_and_a_second_animation_is_told(duet: Scene, bo
     assert "animation 'waves' is not read: it moves what 'Armature0 moves' moves" in "\n".join(got.notes)
 
 
-def opened(path: Path) -> glb_strangers.Written:
-    """A file to go on with."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    glb = glb_strangers.Written()
-    glb.document, glb.binary = json.loads(data[20 : 20 + size]), data[28 + size :]
-    return glb
-
-
 def test_controls_beside_the_hips_hang_on_the_armature_which_is_the_root(
     duet: Scene, body: Body, tmp_path: Path
 ) -> None:
     path = stranger(duet, body, tmp_path / "a.glb", armature=Z_UP_CENTIMETRES)
-    glb = opened(path)
+    glb = glb_strangers.opened(path)
     top = next(k for k, node in enumerate(glb.document["nodes"]) if node["name"] == "Armature0")
     control = glb.add("nodes", {"name": "ik_target"})
     glb.document["nodes"][top]["children"].append(control)
@@ -188,10 +179,12 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
             r"its numbers are in another file \(motion.bin\)",
         ),
         (lambda d: d.update(nodes=7), "its parts do not go together"),
+        (lambda d: d["accessors"][0].update(count=0), "a translation has no frames"),
+        (lambda d: d["accessors"][2].update(type="VEC3"), "a rotation has 3 numbers, expected 4"),
     ],
 )
 def test_what_is_damaged_is_refused_in_one_line(change, said: str, duet: Scene, body: Body, tmp_path: Path) -> None:
-    glb = opened(stranger(duet, body, tmp_path / "a.glb"))
+    glb = glb_strangers.opened(stranger(duet, body, tmp_path / "a.glb"))
     keep, glb.document["buffers"] = glb.document, [{"byteLength": len(glb.binary)}]
     change(glb.document)
     text = json.dumps(keep).encode()

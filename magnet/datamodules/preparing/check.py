@@ -182,7 +182,10 @@ def recognise(root: Path) -> str:
     if len(found) == 1:
         return found[0]
     if found:
-        raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name")
+        own = [kind for name in found if issubclass(kind := registry.reader(name), OwnReader)]
+        reads = " and ".join(f"{kind.name} reads {' and '.join(kind.suffixes)}" for kind in own)
+        alone = f"; {reads} alone, each as scenes of its own" if own else ""
+        raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name{alone}")
     raise ValueError(
         f"{root} is neither a prepared store nor a download that is known; it holds {listing(root)}; give "
         "another folder, or say which data set it should be with --name, to be told what is missing"

@@ -277,6 +277,24 @@ class OwnReader(Reader, Generic[T]):
         return [track.resampled(FPS) for track in tracks]
 
 
+def require_alone(path: Path, people: int, alone: bool) -> None:
+    """Refuse several people in one of a scene's several files.
+
+    Args:
+        path: the file.
+        people: how many it holds.
+        alone: it is the only one of its scene.
+
+    Raises:
+        DataError: it is not.
+    """
+    if people > 1 and not alone:
+        raise DataError(
+            f"{path}: holds {people} people, but other files belong to its scene, too; of several files each holds "
+            "one person: rename it, or put it elsewhere"
+        )
+
+
 def part_name(scene: str, split: Split) -> str:
     """What the part of a scene that is split in time is called."""
     return f"{scene} ({split})"
