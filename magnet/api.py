@@ -392,5 +392,5 @@ def _slots(name: str, agents: int | Sequence[int], count: int, has: str = "the s
     several = (agents,) if isinstance(agents, int | np.integer) else agents
     require_wholes(name, several)
     if strange := [agent for agent in several if not 0 <= agent < count]:
-        raise ValueError(f"{name} {strange[0]}: {has} 0 to {count - 1}")
+        raise ValueError(f"{name} {strange[0]}: {f'{has} 0 to {count - 1}' if count else 'nobody is in the scene'}")
     return tuple(int(agent) for agent in several)

@@ -190,7 +190,7 @@ def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsy
     assert torch.equal(Scene.load(out).betas, betas)
     one = scene.permute_agents(torch.tensor([0])).save(tmp_path / "one.npz")
     assert cli.main(["export", str(ours), str(tmp_path / "they.bvh")]) == 0
-    characters = [str(tmp_path / f"they_{agent}.bvh") for agent in (0, 1)]
+    characters = [str(tmp_path / f"they_person{agent}.bvh") for agent in (0, 1)]
     assert cli.main(["refine", str(plain), str(out), "--shapes", *characters]) == 0
     sizes, wanted = (load_body().rest_joints(each[0])[:, 15, 1] for each in (Scene.load(out).betas, betas))
     assert torch.allclose(sizes, wanted, atol=0.02), "of other skeletons"
