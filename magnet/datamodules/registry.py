@@ -201,7 +201,9 @@ def reader(name: str) -> type[Reader]:
             raise ValueError(f"{name} has no files to prepare: {fit_command(entry.name)} trains on it")
     DATA.require_loaded(name)
     close = difflib.get_close_matches(name.lower(), known, n=1)
+    by_suffix = [one for one, kind in known.items() if f".{name.lower()}" in getattr(kind, "suffixes", ())]
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    hint = f"{' and '.join(by_suffix)} reads such files" if by_suffix else hint
     names = dict.fromkeys(each.name for each in DATA.failed)
     failed = f" ({', '.join(names)} failed to load: magnet data list says why)" if names else ""
     raise ValueError(f"no data set {name!r}; {hint}{failed}")

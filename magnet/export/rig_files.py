@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from magnet.export.bvh_read import read_bvh
+from magnet.export.cutting import kept_frames
 from magnet.export.fbx import converted
 from magnet.export.glb_read import read_glb
 from magnet.export.rig_motion import RigMotion
@@ -35,13 +37,21 @@ def _bvh(path: Path, start: int, end: int | None) -> list[RigMotion]:
 
 
 def _fbx(path: Path, start: int, end: int | None) -> list[RigMotion]:
+    facts = regular(path).stat()
+    people = _fbx_as_it_was(str(path), facts.st_mtime_ns, facts.st_size)
+    kept = kept_frames(path, people[0].frames, start, end)
+    return [replace(each, path=path, place=each.place[kept], local=each.local[kept]) for each in people]
+
+
+@functools.lru_cache(maxsize=2)
+def _fbx_as_it_was(path: str, changed: int, size: int) -> list[RigMotion]:
+    """Everybody in an FBX, which Blender takes seconds to open: whoever checks and cuts a file asks for it again."""
     with tempfile.TemporaryDirectory() as folder:
-        glb = converted(regular(path), Path(folder) / "scene.glb")
+        glb = converted(Path(path), Path(folder) / "scene.glb")
         try:
-            people = read_glb(glb, start, end)
+            return read_glb(glb)
         except ValueError as error:
-            raise ValueError(str(error).replace(str(glb), str(path))) from error
-        return [replace(person, path=path) for person in people]
+            raise ValueError(str(error).replace(str(glb), path)) from error
 
 
 RIGS: dict[str, Callable[[Path, int, int | None], list[RigMotion]]] = {".bvh": _bvh, ".glb": read_glb, ".fbx": _fbx}

@@ -312,6 +312,9 @@ def test_every_module_of_the_list_registers_something_and_no_name_is_taken_twice
 
 def test_a_wrong_name_suggests_the_closest_and_synthetic_needs_no_preparing() -> None:
     assert registry.reader("InterX") is registry.reader("interx")
+    for suffix, named in (("fbx", "glb"), ("NPZ", "scenes")):
+        with pytest.raises(ValueError, match=f"no data set '{suffix}'; {named} reads such files"):
+            registry.reader(suffix)
     with pytest.raises(ValueError, match="no data set 'interXX'; did you mean interx"):
         registry.reader("interXX")
     with pytest.raises(ValueError, match=r"synthetic has no files to prepare: magnet fit .* --data Synthetic trains"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 
 from magnet import cli
 from magnet.body import Body
-from magnet.export import fbx
+from magnet.export import fbx, rig_files, save_glb
 from magnet.testing import random_scene
 
 
@@ -43,3 +44,24 @@ def test_blenders_own_words_are_passed_on(
     with pytest.raises(ValueError, match="could not write it: ModuleNotFoundError: No module named 'bpy'"):
         fbx.save_fbx(random_scene(1, 4, 1, torch.Generator().manual_seed(4)), tmp_path / "one.fbx", body)
     assert not list(tmp_path.iterdir())
+
+
+def test_blender_opens_a_file_once_for_whoever_asks_again_and_anew_when_it_changed(
+    tmp_path: Path, body: Body, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+
+    def converted(path: Path, glb: Path) -> Path:
+        opened.append(path.name)
+        return Path(shutil.copy(path, glb))
+
+    monkeypatch.setattr(rig_files, "converted", converted)
+    scene = random_scene(1, 12, 2, torch.Generator().manual_seed(4))
+    path = save_glb(scene, tmp_path / "a.glb", body).rename(tmp_path / "a.fbx")
+    assert [each.frames for each in rig_files.read_rigs(path)] == [12, 12]
+    part = rig_files.read_rigs(path, 2, 7)
+    assert opened == ["a.fbx"] and [each.frames for each in part] == [5, 5] and part[0].path == path
+    save_glb(scene.slice(0, 9), tmp_path / "a.glb", body).replace(path)
+    assert rig_files.read_rigs(path)[0].frames == 9 and opened == ["a.fbx"] * 2
+    with pytest.raises(ValueError, match=r"a\.fbx: holds 9 frames, so end 20 is behind them"):
+        rig_files.read_rigs(path, end=20)
