@@ -10,6 +10,7 @@ from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.reading.rigs import RigReader, RigTrack
 from magnet.datamodules.registry import register_reader
+from magnet.export.rig import people_of
 from magnet.export.rig_files import read_rigs
 
 
@@ -42,7 +43,7 @@ class GLBReader(RigReader):
         """The people in a file."""
         path = person_file.file
         try:
-            people = read_rigs(path)
+            people = people_of(read_rigs(path), self.joints)
         except ImportError as error:  # an FBX without Blender
             raise DataError(f"{path}: {error}") from error
         except (ValueError, OSError) as error:

@@ -22,7 +22,7 @@ from magnet.body.joints import (  # isort: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock
-from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, understood_together
+from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, people_of, understood_together
 from magnet.export.rig_files import read_rigs
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resampled
@@ -145,7 +145,7 @@ def load_rigs(
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    files = [rig for path in each for rig in read_rigs(path, start, end)]
+    files = [rig for path in each for rig in people_of(read_rigs(path, start, end), joints)]
     require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
     if len(rates) > 1 and fps is None:

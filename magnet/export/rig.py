@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,20 @@ def understood_together(
             notes += told_against(up, agreed(stances)) if up else []
         found.append(_skeleton(file, naming, units[k], ups[k], *moved[k], tuple(notes)))
     return found
+
+
+def people_of(rigs: list[RigMotion], given: Mapping[str, str] | None) -> list[RigMotion]:
+    """The people among the skeletons of one file: without animals and things, of which a note tells.
+
+    All of them where nobody's joints are known, so that reading them says what is missing.
+    """
+    known = [not recognised(rig.names, given).missing for rig in rigs]
+    left = [rig.person for rig, is_known in zip(rigs, known, strict=True) if not is_known]
+    people = [rig for rig, is_known in zip(rigs, known, strict=True) if is_known]
+    if not left or not people:
+        return rigs
+    note = f"left out, as their joints are not named like a person's: {', '.join(left)}"
+    return [replace(people[0], notes=(*people[0].notes, note)), *people[1:]]
 
 
 def _named(file: RigMotion, given: Mapping[str, str] | None) -> Naming:

@@ -123,6 +123,22 @@ def test_hair_on_a_head_is_nobody_and_a_second_animation_is_told(duet: Scene, bo
     assert "animation 'waves' is not read: it moves what 'Armature0 moves' moves" in "\n".join(got.notes)
 
 
+def test_animals_and_things_are_left_out_and_told_of(duet: Scene, body: Body, tmp_path: Path) -> None:
+    path = stranger(duet, body, tmp_path / "a.glb")
+    glb = glb_strangers.opened(path)
+    for number, skin in enumerate(glb.document["skins"][:1]):
+        for k in skin["joints"]:
+            glb.document["nodes"][k]["name"] = f"tail{number}.{k}"
+    got = read(glb.save(path))
+    assert got.scene.agents == 1 and off(got.scene, duet.people().select([1]), body) < 1e-4
+    assert "left out, as their joints are not named like a person's: Armature0" in got.notes[0]
+    for skin in glb.document["skins"][1:]:
+        for k in skin["joints"]:
+            glb.document["nodes"][k]["name"] = f"tail.{k}"
+    with pytest.raises(ValueError, match=r"a\.glb: cannot tell which joint is left_hip"):
+        read(glb.save(path))
+
+
 def test_controls_beside_the_hips_hang_on_the_armature_which_is_the_root(
     duet: Scene, body: Body, tmp_path: Path
 ) -> None:
