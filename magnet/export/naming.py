@@ -32,13 +32,13 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "Mixamo, MotionBuilder": {
         "hip": ("upleg", "upperleg", "thigh"), "knee": ("leg", "lowleg", "lowerleg", "shin"), "ankle": ("foot",),
-        "foot": ("toebase", "toe"), "collar": ("shoulder", "collar"), "shoulder": ("arm", "uparm", "upperarm"),
+        "foot": ("toebase", "toe", "toes"), "collar": ("shoulder", "collar"), "shoulder": ("arm", "uparm", "upperarm"),
         "elbow": ("forearm", "lowarm", "lowerarm"), "wrist": ("hand",), "neck": ("neck", "neck1"), "head": ("head",),
     },
-    "3ds Max Biped, Unreal, Rigify": {
+    "3ds Max Biped, Unreal, Rigify, Character Creator": {
         "hip": ("thigh",), "knee": ("calf", "shin"), "ankle": ("foot",), "foot": ("toe0", "toe", "ball", "toebase"),
         "collar": ("clavicle", "shoulder"), "shoulder": ("upperarm",), "elbow": ("forearm", "lowerarm"),
-        "wrist": ("hand",), "neck": ("neck", "neck01", "neck1"), "head": ("head",),
+        "wrist": ("hand",), "neck": ("neck", "neck01", "neck1", "necktwist01"), "head": ("head",),
     },
     "Motive": {
         "hip": ("thigh",), "knee": ("shin",), "ankle": ("foot",), "foot": ("toe",), "collar": ("shoulder",),
@@ -49,12 +49,35 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
         "shoulder": ("humerus",), "elbow": ("radius",), "wrist": ("hand", "wrist"), "neck": ("lowerneck",),
         "head": ("head",),
     },
+    "Daz": {
+        "hip": ("thighbend",), "knee": ("shin",), "ankle": ("foot",), "foot": ("toe",), "collar": ("collar",),
+        "shoulder": ("shldrbend",), "elbow": ("forearmbend",), "wrist": ("hand",), "neck": ("necklower",),
+        "head": ("head",),
+    },
+    "MakeHuman": {
+        "hip": ("upperleg01",), "knee": ("lowerleg01",), "ankle": ("foot",), "foot": ("toe11",),
+        "collar": ("clavicle",), "shoulder": ("upperarm01",), "elbow": ("lowerarm01",), "wrist": ("wrist",),
+        "neck": ("neck01",), "head": ("head",),
+    },
+    "Meta": {
+        "hip": ("upperleg",), "knee": ("lowerleg",), "ankle": ("footankle",), "foot": ("football",),
+        "collar": ("shoulder",), "shoulder": ("armupper",), "elbow": ("armlower",), "wrist": ("handwrist",),
+        "neck": ("neck",), "head": ("head",),
+    },
+    "MikuMikuDance": {
+        "hip": ("leg",), "knee": ("knee",), "ankle": ("ankle",), "foot": ("toe",), "collar": ("shoulder",),
+        "shoulder": ("arm",), "elbow": ("elbow",), "wrist": ("wrist",), "neck": ("neck",), "head": ("head",),
+    },
 }  # fmt: skip
 """Names of each role without the side, spaces or punctuation. One word means another joint in another scheme.
 
 CMU's bone `wrist`, which its conversions call Hand, is the last third of the forearm: the wrist is where the next one
 begins.
 """
+PREFIX = re.compile(r"(?i)^(bip\d+|mixamorig\d*|skeleton\d*|character\d*|def|org|j_bip|j_sec|cc_base)[ _.\-]*(?=.)")
+"""What names of only some of a skeleton's joints begin with."""
+NUMBERED, MOST = re.compile(r"_(\d+)$"), 0.8
+"""The number of a node behind a joint's name, and the share of names that end in another one each where it is that."""
 SIGNS = {"CMU": "left:hipjoint"}
 """A joint that identifies a scheme whose other names also occur in another scheme."""
 
@@ -121,16 +144,18 @@ def _matched(words: Sequence[tuple[str, set[str]]], roles: Mapping[str, tuple[st
 
 
 def plain(names: Sequence[str]) -> list[str]:
-    """Names without what all of them begin with: a namespace, a character's name, Bip01."""
+    """Names without what all of them begin with: a namespace, a character's name, Bip01; and without the number of
+    the node that most end in, as Sketchfab writes it."""
     short = [name.rsplit(":", 1)[-1] for name in names]
+    numbers = [found[1] for name in short if (found := NUMBERED.search(name))]
+    if len(set(numbers)) > MOST * len(names):
+        short = [NUMBERED.sub("", name) for name in short]
     least, most = min(short, default=""), max(short, default="")
     same = next((i for i, (a, b) in enumerate(zip(least, most, strict=False)) if a != b), min(len(least), len(most)))
     # A prefix ends where a word does: "Left" must not be cut off from two joints that both are left.
     cut = max((m.end() for m in re.finditer(r"[ _.\-]", least[:same])), default=0)
     short = [name[cut:] for name in short]
-    return [
-        re.sub(r"(?i)^(bip\d+|mixamorig\d*|skeleton|character\d*|def|org)[ _.\-]*(?=.)", "", name) for name in short
-    ]
+    return [PREFIX.sub("", name) for name in short]
 
 
 def split_side(name: str) -> tuple[str, set[str]]:
@@ -146,6 +171,10 @@ def split_side(name: str) -> tuple[str, set[str]]:
         if letters.endswith(side):
             return side, {f"{side}:{letters[: -len(side)]}"}
     words = [word.lower() for word in re.split(r"[ _.\-]+", name) if word]
+    for middle in ("c", "m"):  # centre, middle
+        if middle in words and len(words) > 1:
+            words.remove(middle)
+            return "", {"".join(words)}
     for letter, side in (("l", "left"), ("r", "right")):
         if letter in words and len(words) > 1:
             words.remove(letter)

@@ -1,0 +1,120 @@
+"""Joints of many programs' skeletons, by the names that those programs give them."""
+
+from __future__ import annotations
+
+import pytest
+
+from magnet.body.joints import JOINT_NAMES
+from magnet.export.naming import plain, recognised, split_side
+
+MIXAMO = [
+    *("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand"),
+    *("LeftHandThumb1", "RightShoulder", "RightArm", "RightForeArm", "RightHand", "LeftUpLeg", "LeftLeg", "LeftFoot"),
+    *("LeftToeBase", "RightUpLeg", "RightLeg", "RightFoot", "RightToeBase"),
+]
+USUAL = "LeftUpLeg LeftLeg LeftFoot LeftToeBase LeftShoulder LeftArm LeftForeArm LeftHand Neck Head"
+SKELETONS: dict[str, tuple[str, str]] = {
+    "Mixamo": (" ".join(f"mixamorig:{name}" for name in MIXAMO), " ".join(f"mixamorig:{x}" for x in USUAL.split())),
+    "Mixamo in glTF": (
+        " ".join(f"mixamorig{name}" for name in MIXAMO),
+        " ".join(f"mixamorig{x}" for x in USUAL.split()),
+    ),
+    "OptiTrack": (
+        " ".join(f"Skeleton001_{name}" for name in MIXAMO),
+        " ".join(f"Skeleton001_{x}" for x in USUAL.split()),
+    ),
+    "HumanIK with name spaces": (
+        " ".join(f"anna:rig:{x}" for x in MIXAMO),
+        " ".join(f"anna:rig:{x}" for x in USUAL.split()),
+    ),
+    "Sketchfab": (
+        " ".join(f"mixamorig:{name}_{k:02}" for k, name in enumerate(MIXAMO)),
+        " ".join(f"mixamorig:{name}_{MIXAMO.index(name):02}" for name in USUAL.split()),
+    ),
+    "VRoid": (
+        "Root J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_UpperChest J_Bip_C_Neck J_Bip_C_Head J_Sec_L_Bust1 "
+        "J_Bip_L_Shoulder J_Bip_L_UpperArm J_Bip_L_LowerArm J_Bip_L_Hand J_Bip_L_Index1 J_Bip_R_Shoulder "
+        "J_Bip_R_UpperArm J_Bip_R_LowerArm J_Bip_R_Hand J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot "
+        "J_Bip_L_ToeBase J_Bip_R_UpperLeg J_Bip_R_LowerLeg J_Bip_R_Foot J_Bip_R_ToeBase",
+        "J_Bip_L_UpperLeg J_Bip_L_LowerLeg J_Bip_L_Foot J_Bip_L_ToeBase J_Bip_L_Shoulder J_Bip_L_UpperArm "
+        "J_Bip_L_LowerArm J_Bip_L_Hand J_Bip_C_Neck J_Bip_C_Head",
+    ),
+    "VRM": (
+        "hips spine chest upperChest neck head leftUpperLeg leftLowerLeg leftFoot leftToes rightUpperLeg rightLowerLeg "
+        "rightFoot rightToes leftShoulder leftUpperArm leftLowerArm leftHand rightShoulder rightUpperArm "
+        "rightLowerArm rightHand",
+        "leftUpperLeg leftLowerLeg leftFoot leftToes leftShoulder leftUpperArm leftLowerArm leftHand neck head",
+    ),
+    "Character Creator": (
+        "RL_BoneRoot CC_Base_Hip CC_Base_Pelvis CC_Base_L_Thigh CC_Base_L_Calf CC_Base_L_Foot CC_Base_L_ToeBase "
+        "CC_Base_L_CalfTwist01 CC_Base_R_Thigh CC_Base_R_Calf CC_Base_R_Foot CC_Base_R_ToeBase CC_Base_Waist "
+        "CC_Base_Spine01 CC_Base_Spine02 CC_Base_NeckTwist01 CC_Base_NeckTwist02 CC_Base_Head CC_Base_L_Clavicle "
+        "CC_Base_L_Upperarm CC_Base_L_Forearm CC_Base_L_Hand CC_Base_R_Clavicle CC_Base_R_Upperarm "
+        "CC_Base_R_Forearm CC_Base_R_Hand",
+        "CC_Base_L_Thigh CC_Base_L_Calf CC_Base_L_Foot CC_Base_L_ToeBase CC_Base_L_Clavicle CC_Base_L_Upperarm "
+        "CC_Base_L_Forearm CC_Base_L_Hand CC_Base_NeckTwist01 CC_Base_Head",
+    ),
+    "Unreal's Manny": (
+        "root pelvis spine_01 spine_02 spine_03 spine_04 spine_05 neck_01 neck_02 head clavicle_l upperarm_l "
+        "upperarm_twist_01_l lowerarm_l hand_l index_01_l clavicle_r upperarm_r lowerarm_r hand_r thigh_l "
+        "thigh_twist_01_l calf_l foot_l ball_l thigh_r calf_r foot_r ball_r ik_foot_root ik_foot_l ik_hand_root "
+        "ik_hand_gun ik_hand_l",
+        "thigh_l calf_l foot_l ball_l clavicle_l upperarm_l lowerarm_l hand_l neck_01 head",
+    ),
+    "Daz Genesis 8": (
+        "hip pelvis lThighBend lThighTwist lShin lFoot lMetatarsals lToe rThighBend rThighTwist rShin rFoot "
+        "rMetatarsals rToe abdomenLower abdomenUpper chestLower chestUpper lCollar lShldrBend lShldrTwist "
+        "lForearmBend lForearmTwist lHand rCollar rShldrBend rShldrTwist rForearmBend rForearmTwist rHand neckLower "
+        "neckUpper head",
+        "lThighBend lShin lFoot lToe lCollar lShldrBend lForearmBend lHand neckLower head",
+    ),
+    "MakeHuman": (
+        "root pelvis.L upperleg01.L upperleg02.L lowerleg01.L lowerleg02.L foot.L toe1-1.L pelvis.R upperleg01.R "
+        "upperleg02.R lowerleg01.R lowerleg02.R foot.R toe1-1.R spine05 spine04 spine03 spine02 spine01 neck01 "
+        "neck02 neck03 head clavicle.L shoulder01.L upperarm01.L upperarm02.L lowerarm01.L lowerarm02.L wrist.L "
+        "clavicle.R shoulder01.R upperarm01.R upperarm02.R lowerarm01.R lowerarm02.R wrist.R",
+        "upperleg01.L lowerleg01.L foot.L toe1-1.L clavicle.L upperarm01.L lowerarm01.L wrist.L neck01 head",
+    ),
+    "Meta's body tracking": (
+        "Root Hips SpineLower SpineMiddle SpineUpper Chest Neck Head LeftShoulder LeftScapula LeftArmUpper "
+        "LeftArmLower LeftHandWristTwist LeftHandPalm LeftHandWrist RightShoulder RightScapula RightArmUpper "
+        "RightArmLower RightHandWrist LeftUpperLeg LeftLowerLeg LeftFootAnkle LeftFootBall RightUpperLeg "
+        "RightLowerLeg RightFootAnkle RightFootBall",
+        "LeftUpperLeg LeftLowerLeg LeftFootAnkle LeftFootBall LeftShoulder LeftArmUpper LeftArmLower LeftHandWrist "
+        "Neck Head",
+    ),
+    "MikuMikuDance": (
+        "center lower_body upper_body upper_body2 neck head leg_L knee_L ankle_L toe_L leg_R knee_R ankle_R toe_R "
+        "shoulder_L arm_L elbow_L wrist_L shoulder_R arm_R elbow_R wrist_R",
+        "leg_L knee_L ankle_L toe_L shoulder_L arm_L elbow_L wrist_L neck head",
+    ),
+    "Advanced Skeleton": (
+        "Root_M Hip_R Knee_R Ankle_R Toes_R Spine1_M Chest_M Neck_M Head_M Collar_R Shoulder_R Elbow_R Wrist_R "
+        "Collar_L Shoulder_L Elbow_L Wrist_L Hip_L Knee_L Ankle_L Toes_L",
+        "Hip_L Knee_L Ankle_L Toes_L Collar_L Shoulder_L Elbow_L Wrist_L Neck_M Head_M",
+    ),
+}
+LEFT = ("left_hip", "left_knee", "left_ankle", "left_foot", "left_collar", "left_shoulder", "left_elbow", "left_wrist")
+NEEDED = tuple(ours for ours in LEFT if ours not in ("left_foot", "left_collar"))
+
+
+@pytest.mark.parametrize("program", SKELETONS)
+def test_joints_are_recognised_by_the_names_of_programs(program: str) -> None:
+    names, expected = (said.split() for said in SKELETONS[program])
+    found = recognised(names)
+    assert not found.missing
+    for ours, theirs in zip((*LEFT, "neck", "head"), expected, strict=True):
+        assert names[found.joints[JOINT_NAMES.index(ours)]] == theirs, ours
+    right = [found.joints[JOINT_NAMES.index(ours.replace("left", "right"))] for ours in LEFT if ours in NEEDED]
+    assert not {names[k] for k in right} & set(expected) and len(set(right)) == len(NEEDED)
+
+
+def test_numbers_that_tell_joints_apart_stay() -> None:
+    assert plain(["spine_01", "spine_02", "head", "thigh_l", "thigh_r"])[:2] == ["spine_01", "spine_02"]
+    bare = ["hip", "knee", "ankle", "neck", "head"]
+    assert plain([f"{name}_{k}" for k, name in enumerate(bare)]) == bare
+
+
+def test_the_middle_of_a_body_is_no_side() -> None:
+    assert split_side("C_Hips") == split_side("Hips_M") == ("", {"hips"})
+    assert split_side("L_Hip")[0] == "left" and split_side("chest") == ("", {"chest"})
