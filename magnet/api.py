@@ -83,7 +83,7 @@ def read(
     start: int = 0,
     end: int | None = None,
 ) -> Motion:
-    """Read a scene from our own file, SMPL-X npz, or BVH, GLB or FBX of any skeleton; several files are several people.
+    """Read a scene from our file, SMPL-X npz, BVH, GLB or FBX of any skeleton, or CSV; several are several people.
 
     Args:
         paths: the files, or lists of them.

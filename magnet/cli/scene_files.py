@@ -30,7 +30,7 @@ def parser_of(command: str, description: str | None, epilog: str, inputs: str = 
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
     options.add_argument(
-        "inputs", nargs=inputs, metavar="IN", help="a .npz, .bvh, .glb or .fbx; several are several people"
+        "inputs", nargs=inputs, metavar="IN", help="a .npz, .bvh, .glb, .fbx or .csv; several are several people"
     )
     return options
 
@@ -105,7 +105,11 @@ def add_look(options: Options) -> None:
     options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
 
 
-IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz files that do not say it"}
+IN_FPS: dict[str, Any] = {
+    "type": float,
+    "metavar": "FPS",
+    "help": "frames a second of .npz, .csv without it",
+}
 """An option of commands that read files."""
 START: dict[str, Any] = {
     "type": int,

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_flag, require_number, require_whole
 from magnet.export.cutting import rates_note
 from magnet.export.formats import MOST_FPS, WRITTEN
+from magnet.export.joints_read import load_joints
 from magnet.export.npz_files import is_ours, read_people
 from magnet.export.retarget import load_rigs, together
 from magnet.export.rig_files import RIGS
@@ -19,7 +21,8 @@ from magnet.files import regular
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 
-READ = (".npz", *RIGS)
+TABLE = ".csv"
+READ = (".npz", *RIGS, TABLE)
 """Suffixes that can be read."""
 UNSEEN = 0.0005
 """Metres by which people are moved without a word."""
@@ -43,9 +46,9 @@ class Reading:
         trim: cut people of different lengths to the shortest.
         unit: of lengths; None: of an npz metres, else by the length of legs.
         up: axis of the file that points up; None: found.
-        joints: for BVH, GLB and FBX: our joint's name to the file's, if no naming scheme fits.
+        joints: for all but npz: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
-        in_fps: frames a second of npz files that do not say it.
+        in_fps: frames a second of npz and csv files that do not say it.
         start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
     """
 
@@ -78,7 +81,7 @@ class Reading:
 def read(
     paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
 ) -> Read:
-    """Read a scene from a Scene npz, or from SMPL-X npz, BVH, GLB or FBX files; several files are several people.
+    """Read a scene from a Scene npz, or from SMPL-X npz, BVH, GLB, FBX or CSV files; several files are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
@@ -90,12 +93,13 @@ def read(
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     options = options or Reading()
     suffixes = {file.suffix.lower() for file in files}
-    if not suffixes or not (suffixes == {".npz"} or suffixes <= set(RIGS)):
+    if not suffixes or not (suffixes in ({".npz"}, {TABLE}) or suffixes <= set(RIGS)):
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
         also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
+        rigs = ", ".join(RIGS)
         raise ValueError(
-            f"cannot read {names}: expected .npz files alone, or files of skeletons ({', '.join(RIGS)}){only}"
+            f"cannot read {names}: expected .npz or {TABLE} files alone, or files of skeletons ({rigs}){only}"
         )
     for file in files:
         if not file.exists():
@@ -105,7 +109,7 @@ def read(
     if suffixes <= set(RIGS):
         if options.in_fps is not None:
             said = f"a {min(suffixes)} says its own, --fps resamples"
-            raise ValueError(f"in_fps: is for .npz files that say no frame rate; {said}")
+            raise ValueError(f"in_fps: is for .npz and {TABLE} files that say no frame rate; {said}")
         told = {name: value for name, value in vars(options).items() if name != "in_fps"}
         imported = load_rigs(files, body, **told)
         notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
@@ -113,8 +117,12 @@ def read(
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
             notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
+    if suffixes == {TABLE}:
+        return _from_tables(files, body, options)
     if options.joints:
-        raise ValueError(f"{files[0]}: joint: is for {', '.join(RIGS)}; in an .npz joints are where SMPL-X has them")
+        raise ValueError(
+            f"{files[0]}: joint: is for {', '.join((*RIGS, TABLE))}; in an .npz joints are where SMPL-X has them"
+        )
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = [note for one in people for note in one.notes]
@@ -128,6 +136,17 @@ def read(
     scene = together(scenes, labels, fps=options.fps, trim=options.trim)
     notes += rates_note([one.fps for one in scenes], scene.fps)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
+
+
+def _from_tables(files: Sequence[Path], body: Body, options: Reading) -> Read:
+    """People by the positions of their joints, on a body and on the floor."""
+    how: dict[str, Any] = {"unit": options.unit, "up": options.up, "joints": options.joints, "fps": options.in_fps}
+    how |= {"start": options.start, "end": options.end}
+    read_so = [load_joints(file, body, **how) for file in files]
+    scenes, notes = [scene for scene, *_ in read_so], [note for _, note, _ in read_so]
+    scene = together(scenes, [str(file) for file in files], fps=options.fps, trim=options.trim)
+    notes += rates_note([one.fps for one in scenes], scene.fps)
+    return _grounded(scene, body, notes, () if options.keep_floor else [not ours for *_, ours in read_so])
 
 
 def shared(options: Reading, *groups: Sequence[str | Path]) -> list[Reading]:
@@ -144,6 +163,8 @@ def _suits(file: Path) -> set[str]:
     """The options that only some kinds of file take, and this one does."""
     if file.suffix.lower() in RIGS:
         return {"unit", "up", "joints"}
+    if file.suffix.lower() == TABLE:
+        return {"unit", "up", "joints", "in_fps"}
     return set() if is_ours(file) else {"unit", "up", "in_fps"}
 
 

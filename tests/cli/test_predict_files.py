@@ -329,9 +329,9 @@ def test_files_may_stand_behind_options() -> None:
     ("words", "message"),
     [
         (["none.npz"], "none.npz: no such file"),
-        (["OURS", "none.txt"], "expected .npz files alone, or files of skeletons"),
+        (["OURS", "none.txt"], "expected .npz or .csv files alone, or files of skeletons"),
         (["OURS", "--people", "1"], "--people 1: expected at least 2"),
-        (["motion.usdz"], "cannot read motion.usdz: expected .npz files alone, or files of skeletons"),
+        (["motion.usdz"], "cannot read motion.usdz: expected .npz or .csv files alone, or files of skeletons"),
         (["OURS", "--task", "joint_futur"], "did you mean joint_future?"),
         (["OURS", "--task", "inbetweening", "--task.evry", "3"], "did you mean --task.every?"),
     ],

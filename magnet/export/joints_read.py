@@ -1,0 +1,169 @@
+"""People on a body by the positions of their joints, from a table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from magnet.body.base import MOST_SHAPE, Body
+from magnet.body.fit import BodyFit, fit_body
+from magnet.body.joints import HIPS, JOINT_NAMES, L_ANKLE, L_HIP, L_KNEE, NECK, SHOULDERS
+from magnet.export.cutting import kept_frames
+from magnet.export.joints_table import JointTable, read_table
+from magnet.export.naming import recognised
+from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
+from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP
+from magnet.export.rig_motion import Bools, Floats
+from magnet.export.upright import WARNING
+from magnet.motion.scene import BODY_JOINTS, Scene
+
+OURS = "our own names"
+BRIDGED = 0.2
+"""Weight of a joint where it is missing, beside where it is known: it is taken to be on a straight line between."""
+UPRIGHT, CLEAR = 0.5, 0.8
+"""Cosine between torsos and the axis that is said to be up, below which it is doubted; and from which one is found."""
+
+
+def load_joints(
+    path: str | Path,
+    body: Body,
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    joints: Mapping[str, str] | None = None,
+    fps: float | None = None,
+    start: int = 0,
+    end: int | None = None,
+) -> tuple[Scene, str, bool]:
+    """The people of a table on a body, fitted to their joints; a note on how it was read; whether it is one of ours.
+
+    Frames in which somebody's hips or shoulders are missing are not valid; other joints may be missing now and then.
+
+    Args:
+        unit, up, joints: as `magnet.export.reading.Reading` has them; up is found from where torsos point.
+        fps: the table's frames a second, if it says no time.
+        start, end: the frames that are kept, from 0, without `end`; None: to the last.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: as `read_table`, unknown joints, no unit, no rate, nobody, or no fit.
+    """
+    path, table = Path(path), read_table(path)
+    rate = table.fps or fps
+    if rate is None:
+        raise ValueError(f"{path}: says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
+    if up is not None and up not in UP:
+        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
+    found, weight, scheme = _joints(path, table, joints)
+    used = sorted(weight)
+    at = table.at[kept_frames(path, len(table.at), start, end)][:, :, [found[j] for j in used]]
+    name, notes = _unit(path, at, used, unit or table.unit)
+    sure = np.asarray(np.isfinite(at).all(axis=-1))  # (T, P, M)
+    valid = np.asarray(sure[:, :, [used.index(j) for j in (*HIPS, *SHOULDERS)]].all(axis=-1))
+    for person, there in zip(table.people, valid.T, strict=True):
+        if not there.any():
+            raise ValueError(f"{path}: {person or 'the person'} has hips and shoulders in no frame")
+    up, doubts = _up(at[valid], used, up)
+    weights = np.array([weight[j] for j in used]) * np.where(sure, 1.0, BRIDGED * sure.any(axis=0))
+    fit = _fitted(path, UNITS[name] * _bridged(at @ UP[up].T, sure), used, weights, valid, rate, body)
+    off = float(fit.residual[torch.from_numpy(sure & valid[..., None])].mean())
+    head = f"{path.name}: joint positions, {scheme}, {len(used)} joints; unit {name}, {up} up, {rate:g} fps"
+    notes = [head, f"  the body's joints lie {100 * off:.1f} cm from the file's on average", *notes, *doubts]
+    if off > POOR_FIT:
+        notes.append("  that is much: its proportions are far from a person's; hands and feet may miss")
+    if not valid.all():
+        lack = int(np.count_nonzero(~valid.all(axis=1)))
+        notes.append(f"  {lack} of {len(valid)} frames lack somebody's hips or shoulders: not valid")
+    scene = fit.scene.replace(names=(path.stem,), valid=None if valid.all() else fit.scene.valid)
+    return scene, "\n".join(notes), scheme == OURS
+
+
+def _joints(
+    path: Path, table: JointTable, given: Mapping[str, str] | None
+) -> tuple[dict[int, int], dict[int, float], str]:
+    """Which of the table's joints each of ours is, the weights of those that the body is fitted to, and by what names.
+
+    All of ours count alike; of others limbs and neck, as of rigs: spines and heads lie elsewhere in every one.
+    """
+    if set(table.names) >= set(JOINT_NAMES):
+        found = {j: table.names.index(JOINT_NAMES[j]) for j in range(BODY_JOINTS)}
+        return found, dict.fromkeys(found, 1.0), OURS
+    naming = recognised(table.names, given)
+    if naming.missing:
+        raise ValueError(
+            f"{path}: cannot tell which joint is {', '.join(naming.missing)}; it has {', '.join(table.names)}. "
+            f"Name them: --joint {naming.missing[0]}=ITS_NAME (joints={{...}} in Python)"
+        )
+    sided = {j: w for left, w in TARGETS.items() for j in ((left,) if left == NECK else (left, left + 1))}
+    return naming.joints, {j: w for j, w in sided.items() if j in naming.joints}, f"names of {naming.scheme}"
+
+
+def _fitted(
+    path: Path, at: Floats, used: Sequence[int], weights: Floats, valid: Bools, fps: float, body: Body
+) -> BodyFit:
+    """The body at the joints, with shape numbers that models take. at (T, P, M, 3) metres, weights (T, P, M)"""
+    targets = torch.from_numpy(at).float()
+    more = (torch.from_numpy(weights).float(), torch.from_numpy(valid))
+
+    def fitted(betas: torch.Tensor | None = None) -> BodyFit:
+        own, good = more
+        return fit_body(targets, used, body, weights=own, valid=good, betas=betas, fps=fps, refuse_above=REFUSED_FIT)
+
+    try:
+        fit = fitted()
+        betas = fit.scene.betas[0].clamp(-MOST_SHAPE, MOST_SHAPE)
+        return fit if torch.equal(betas, fit.scene.betas[0]) else fitted(betas)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _bridged(at: Floats, sure: Bools) -> Floats:
+    """Missing joints on straight lines between where they were and will be. at (T, P, M, 3), sure (T, P, M)"""
+    whole, frames = np.nan_to_num(at), np.arange(len(at))
+    for person, joint in np.argwhere(~sure.all(axis=0) & sure.any(axis=0)):
+        known = sure[:, person, joint]
+        for axis in range(3):
+            track = whole[:, person, joint, axis]
+            track[~known] = np.interp(frames[~known], frames[known], track[known])
+    return whole
+
+
+def _unit(path: Path, at: Floats, used: Sequence[int], said: str | None) -> tuple[str, list[str]]:
+    """The unit of length as it is said, else by the legs; and a warning where legs say otherwise. at (T, P, M, 3)"""
+    if said is not None and said not in UNITS:
+        raise ValueError(f"unit {said!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+    hip, knee, ankle = (at[:, :, used.index(j)] for j in (L_HIP, L_KNEE, L_ANKLE))
+    bones = np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
+    leg = float(np.nanmedian(bones)) if np.isfinite(bones).any() else math.nan
+    fitting = [name for name in UNITS if SHORTEST_LEG <= leg * UNITS[name] <= LONGEST_LEG]
+    if said is None:
+        if not fitting:
+            raise ValueError(
+                f"{path}: legs are {leg:.3g} long, which fits no unit of length; say --in_unit m, cm or mm"
+            )
+        return fitting[0], []
+    if said in fitting or math.isnan(leg):
+        return said, []
+    looks = f"; they look like {fitting[0]}" if fitting else ""
+    return said, [f"{WARNING}unit {said}, as said, makes legs {leg * UNITS[said]:.2g} m long{looks}"]
+
+
+def _up(at: Floats, used: Sequence[int], said: str | None) -> tuple[str, list[str]]:
+    """The axis that is up as it is said, else the one along which torsos point; a warning where they point elsewhere.
+
+    at (N, M, 3) in the file's axes, of moments with hips and shoulders
+    """
+    hips, shoulders = (at[:, [used.index(j) for j in pair]].mean(axis=1) for pair in (HIPS, SHOULDERS))
+    torso = shoulders - hips
+    along = np.median(torso / np.maximum(np.linalg.norm(torso, axis=-1, keepdims=True), 1e-9), axis=0)
+    axis = int(np.abs(along).argmax())
+    shown = f"{'-' if along[axis] < 0 else ''}{'xyz'[axis]}"
+    if said is None:
+        return (shown, []) if abs(along[axis]) >= CLEAR else ("y", [])
+    if (UP[said] @ along)[1] >= UPRIGHT:
+        return said, []
+    return said, [f"{WARNING}up {said}, as said, leaves nobody upright: torsos point along {shown}, unless all lie"]

@@ -1,0 +1,132 @@
+"""Tables of joint positions: ours, and those of trackers of joints."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.export.rig_motion import Floats, usual_rate
+from magnet.files import regular
+
+COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
+"""A joint's name, an axis, and perhaps a unit: left_hip_x_m, LeftHip.X, nose_y (mm)."""
+FRAME, TIME = ("frame", "frame_id", "frame_index"), ("time_s", "time", "seconds", "t", "timestamp")
+PERSON = ("person", "person_id", "id", "track", "track_id", "subject", "actor", "skeleton")
+LONGEST = 216_000
+"""Frames that a table is read as at most."""
+
+
+@dataclass(frozen=True)
+class JointTable:
+    """Joints of all P people of one scene, NaN where they are missing."""
+
+    names: tuple[str, ...]  # K
+    people: tuple[str, ...]
+    at: Floats  # (T, P, K, 3) in the table's unit and axes
+    fps: float | None
+    unit: str | None
+
+
+def read_table(path: str | Path) -> JointTable:
+    """Read a table of joint positions: a row for each frame and person, three columns for each joint.
+
+    Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`), and by `frame`, `person` and
+    `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in order, without
+    `time_s` the rate is not known. Cells may be empty.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: no such columns, rows that are cut short, two rows of one frame and person, several scenes.
+    """
+    path = Path(path)
+    with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        first = file.readline()
+        file.seek(0)
+        rows = [row for row in csv.reader(file, delimiter=max(",;\t", key=first.count)) if any(map(str.strip, row))]
+    if len(rows) < 2:
+        raise ValueError(f"{path}: holds no rows under a line of names")
+    head = [name.strip() for name in rows[0]]
+    columns, unit = _columns(path, head)
+    frame_at, time_at, person_at, scene_at = (
+        next((head.index(name) for name in head if name.lower() in names), None)
+        for names in (FRAME, TIME, PERSON, ("scene",))
+    )
+    numbers = np.array(
+        [[_number(path, line, row, k) for k in range(len(head))] for line, row in enumerate(rows[1:], 2)]
+    )
+    if scene_at is not None and len(scenes := {row[scene_at].strip() for row in rows[1:]}) > 1:
+        raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
+    told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
+    people = tuple(dict.fromkeys(told))
+    frame = _frames(path, numbers, frame_at, told)
+    at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
+    where = np.array(list(columns.values()))
+    seen: set[tuple[int, str]] = set()
+    for number, (t, person) in enumerate(zip(frame.tolist(), told, strict=True)):
+        if (t, person) in seen:
+            who = f" of {person}" if person else ""
+            raise ValueError(f"{path}, line {number + 2}: a second row{who} for frame {t}; is a column person missing?")
+        seen.add((t, person))
+        at[t, people.index(person)] = numbers[number][where]
+    fps = None if time_at is None else _rate(numbers[:, time_at], frame)
+    return JointTable(tuple(columns), people, at, fps, unit)
+
+
+def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str | None]:
+    """The three columns of each joint, and the unit that they say."""
+    found: dict[str, dict[str, int]] = {}
+    units = set()
+    for k, name in enumerate(head):
+        if (match := COLUMN.match(name)) and name.lower() not in (*FRAME, *TIME, *PERSON):
+            found.setdefault(match[1], {})[match[2].lower()] = k
+            units.add(match[3].lower() if match[3] else None)
+    whole = {name: [axes[axis] for axis in "xyz"] for name, axes in found.items() if len(axes) == 3}
+    if not whole:
+        raise ValueError(
+            f"{path}: no columns of joints, such as left_hip_x_m, left_hip_y_m, left_hip_z_m; it has "
+            f"{', '.join(head[:8])}{' ...' if len(head) > 8 else ''}"
+        )
+    if len(units) > 1:
+        raise ValueError(f"{path}: its columns are in different units; bring them to one")
+    return whole, units.pop()
+
+
+def _number(path: Path, line: int, row: Sequence[str], k: int) -> float:
+    if k >= len(row):
+        raise ValueError(f"{path}, line {line}: {len(row)} cells, fewer than names; the file may be cut short")
+    try:
+        return float(row[k])
+    except ValueError:
+        return math.nan  # empty, or of a column of words
+
+
+def _frames(path: Path, numbers: Floats, column: int | None, told: Sequence[str]) -> NDArray[np.int64]:
+    """The frame of each row, from 0."""
+    if column is None:
+        count: dict[str, int] = {}
+        frames = []
+        for person in told:
+            frames.append(count.setdefault(person, 0))
+            count[person] += 1
+        return np.array(frames)
+    said = numbers[:, column]
+    if not (np.isfinite(said) & (said == np.round(said))).all():
+        raise ValueError(f"{path}: frame {said[~(said == np.round(said))][0]:g}: expected whole numbers")
+    if said.max() - said.min() >= LONGEST:
+        raise ValueError(f"{path}: frames {said.min():.0f} to {said.max():.0f}, more than is read ({LONGEST})")
+    return (said - said.min()).astype(int)
+
+
+def _rate(seconds: Floats, frame: NDArray[np.int64]) -> float | None:
+    """Frames a second, by the first and the last row that say a time."""
+    good = np.isfinite(seconds)
+    if not good.any() or np.ptp(seconds[good]) <= 0 or np.ptp(frame[good]) <= 0:
+        return None
+    return usual_rate(float(np.ptp(frame[good]) / np.ptp(seconds[good])))

@@ -1,0 +1,129 @@
+"""People by joint positions: our own table, and those of trackers in their units, axes and gaps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magnet
+from magnet import checkpoints, cli
+from magnet.body import Body
+from magnet.body.joints import JOINT_NAMES
+from magnet.export import save_csv
+from magnet.export.reading import Reading, read
+from magnet.motion.scene import Scene
+
+COCO = [
+    "nose",
+    *(
+        f"{side}_{part}"
+        for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in ("left", "right")
+    ),
+]
+TO = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
+"""Rotation of our world to one of this axis up."""
+
+
+@pytest.fixture(scope="module")
+def salsa() -> Scene:
+    """A generated couple's dance of two seconds."""
+    return Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz")
+
+
+def tracked(
+    scene: Scene, body: Body, path: Path, up: str = "y", unit: float = 1.0, noise: float = 0.0, lost=()
+) -> Path:
+    """A tracker's table of COCO's keypoints. lost: (frame, person, joint's name) of cells that are empty"""
+    joints = body.joints(scene)[0].double().numpy() @ TO[up].T
+    joints = unit * (joints + np.random.default_rng(0).normal(0, noise, joints.shape))
+    places = [JOINT_NAMES.index("head" if name == "nose" else name) for name in COCO]
+    lines = ["frame,time_s,person," + ",".join(f"{name}_{axis}" for name in COCO for axis in "xyz")]
+    for t in range(scene.frames):
+        for p in range(scene.agents):
+            cells = [
+                "" if (t, p, name) in lost else f"{number:.5f}"
+                for name, place in zip(COCO, places, strict=True)
+                for number in joints[t, p, place]
+            ]
+            lines.append(f"{t},{t / scene.fps:.5f},{'AB'[p]}," + ",".join(cells))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def off(got: Scene, truth: Scene, body: Body) -> float:
+    """Mean distance of joints, in metres."""
+    return float((body.joints(got) - body.joints(truth)).norm(dim=-1).mean())
+
+
+def test_our_own_table_is_read_back_to_some_millimetres(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    got = read(save_csv(salsa, tmp_path / "a.csv", body))
+    assert off(got.scene, salsa, body) < 0.006 and got.scene.fps == 30.0 and got.scene.valid is None
+    assert "our own names, 22 joints; unit m, y up, 30 fps" in got.notes[0] and len(got.notes) == 1
+
+
+@pytest.mark.parametrize(("up", "unit", "name"), [("y", 1.0, "m"), ("z", 100.0, "cm"), ("z", 1000.0, "mm")])
+def test_twelve_joints_of_a_tracker_are_people_in_any_unit_and_axis(
+    up: str, unit: float, name: str, salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    path = tracked(salsa, body, tmp_path / "a.csv", up, unit, noise=0.005)
+    got = read(path, options=Reading(keep_floor=True))
+    assert off(got.scene, salsa, body) < 0.02 and got.scene.agents == 2
+    assert f"unit {name}, {up} up, 30 fps" in got.notes[0] and "warning" not in got.notes[0]
+
+
+def test_joints_that_are_lost_are_bridged_and_frames_without_hips_are_not_valid(
+    salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    wrist = [(t, 0, "left_wrist") for t in range(20, 24)]
+    hip = [(t, 1, "right_hip") for t in (40, 41)]
+    got = read(tracked(salsa, body, tmp_path / "a.csv", lost=[*wrist, *hip]), options=Reading(keep_floor=True))
+    assert got.scene.valid is not None and (~got.scene.valid[0]).nonzero()[:, 0].tolist() == [40, 41]
+    assert "2 of 64 frames lack somebody's hips or shoulders: not valid" in got.notes[0]
+    away = (body.joints(got.scene) - body.joints(salsa)).norm(dim=-1)[0, 20:24, 0, JOINT_NAMES.index("left_wrist")]
+    assert float(away.max()) < 0.15
+    smooth = body.joints(got.scene)[0, :, 1].diff(n=2, dim=0).norm(dim=-1).amax()
+    assert float(smooth) < 2 * float(body.joints(salsa)[0, :, 1].diff(n=2, dim=0).norm(dim=-1).amax())
+
+
+def test_a_table_without_a_time_asks_for_the_rate_and_a_file_a_person_is_one_scene(
+    salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    paths = []
+    for p in range(2):
+        path = tracked(salsa.people().select([p]), body, tmp_path / f"{p}.csv")
+        rows = [line.split(",") for line in path.read_text().splitlines()]
+        path.write_text("\n".join(",".join([row[0], *row[3:]]) for row in rows) + "\n")
+        paths.append(path)
+    with pytest.raises(ValueError, match=r"0\.csv: says no time; say its frames a second: --in_fps 30"):
+        magnet.read(*paths)
+    got = magnet.read(*paths, in_fps=60, fps=None, keep_floor=True)
+    assert got.fps == 60 and off(got, salsa, body) < 0.02
+
+
+def test_unknown_joints_can_be_told_and_a_wrong_axis_or_unit_is_doubted(
+    salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    path = tracked(salsa, body, tmp_path / "a.csv")
+    path.write_text(path.read_text().replace("left_wrist", "point_9"))
+    with pytest.raises(ValueError, match=r"cannot tell which joint is left_wrist; it has nose, .*--joint left_wrist="):
+        read(path)
+    told = read(path, options=Reading(joints={"left_wrist": "point_9"}, keep_floor=True))
+    assert off(told.scene, salsa, body) < 0.02
+    path = tracked(salsa, body, tmp_path / "b.csv")
+    assert "up z, as said, leaves nobody upright: torsos point along y" in read(path, options=Reading(up="z")).notes[0]
+    assert "unit cm, as said, makes legs 0.00" in read(path, options=Reading(unit="cm")).notes[0]
+    path = tracked(salsa, body, tmp_path / "c.csv", unit=7.0)
+    with pytest.raises(ValueError, match=r"legs are .* long, which fits no unit of length; say --in_unit"):
+        read(path)
+
+
+def test_the_commands_take_them(salsa: Scene, body: Body, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tracked(salsa, body, tmp_path / "a.csv", "z", 1000.0)
+    assert cli.main(["export", str(path), str(tmp_path / "b.npz")]) == 0
+    assert off(Scene.load(tmp_path / "b.npz"), salsa, body) < 0.1
+    assert "a.csv: joint positions" in capsys.readouterr().out
+    assert cli.main(["export", str(path), str(path)]) == 2
+    assert "is read, and would be written over" in capsys.readouterr().err
