@@ -105,6 +105,9 @@ def add_look(options: Options) -> None:
     options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
 
 
+RECORDED = (".npz", ".bvh")
+"""Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
+again."""
 IN_FPS: dict[str, Any] = {
     "type": float,
     "metavar": "FPS",
@@ -234,12 +237,10 @@ def require_not_there(inputs: Sequence[str], outs: Sequence[str]) -> None:
     Raises:
         CommandError: says how to write either.
     """
-    from magnet.export.reading import READ
-
     first, *behind = outs
     known = {*map(Path, inputs)}  # what is read is refused by name
     there = [
-        out for out in behind if Path(out).suffix.lower() in READ and Path(out).exists() and Path(out) not in known
+        out for out in behind if Path(out).suffix.lower() in RECORDED and Path(out).exists() and Path(out) not in known
     ]
     # People and scenes may have got a file each.
     if not there or any(Path(first).parent.glob(f"{glob.escape(Path(first).stem)}*{Path(first).suffix}")):
