@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from magnet.body.base import MOST_SHAPE, Body
 from magnet.body.fit import BodyFit, fit_body
-from magnet.body.joints import HIPS, JOINT_NAMES, L_ANKLE, L_HIP, L_KNEE, NECK, SHOULDERS
+from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, L_ANKLE, L_FOOT, L_HIP, L_KNEE, NECK, SHOULDERS
 from magnet.export.cutting import kept_frames
 from magnet.export.joints_table import JointTable, read_table
 from magnet.export.naming import recognised
@@ -19,9 +20,12 @@ from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
 from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP
 from magnet.export.rig_motion import Bools, Floats
 from magnet.export.upright import WARNING
+from magnet.motion.rotations import about_y
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 OURS = "our own names"
+LOW = 0.05
+"""Metres over its lowest place under which an ankle is that of a foot on the floor."""
 BRIDGED = 0.2
 """Weight of a joint where it is missing, beside where it is known: it is taken to be on a straight line between."""
 UPRIGHT, CLEAR = 0.5, 0.8
@@ -108,10 +112,13 @@ def _fitted(
     """The body at the joints, with shape numbers that models take. at (T, P, M, 3) metres, weights (T, P, M)"""
     targets = torch.from_numpy(at).float()
     more = (torch.from_numpy(weights).float(), torch.from_numpy(valid))
+    feet = None if L_FOOT in used else _level_feet(targets, used)
 
-    def fitted(betas: torch.Tensor | None = None) -> BodyFit:
+    def fitted(betas: Tensor | None = None) -> BodyFit:
         own, good = more
-        return fit_body(targets, used, body, weights=own, valid=good, betas=betas, fps=fps, refuse_above=REFUSED_FIT)
+        return fit_body(
+            targets, used, body, rotations=feet, weights=own, valid=good, betas=betas, fps=fps, refuse_above=REFUSED_FIT
+        )
 
     try:
         fit = fitted()
@@ -119,6 +126,22 @@ def _fitted(
         return fit if torch.equal(betas, fit.scene.betas[0]) else fitted(betas)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _level_feet(targets: Tensor, used: Sequence[int]) -> Tensor:
+    """World rotations of feet whose toes nobody tracked: level and as the person faces where they are low, else NaN.
+
+    targets (T, P, M, 3) -> (T, P, 22, 3, 3)
+    """
+    at = {joint: targets[:, :, used.index(joint)] for joint in (*HIPS, *SHOULDERS, *ANKLES)}
+    left = at[HIPS[0]] - at[HIPS[1]] + at[SHOULDERS[0]] - at[SHOULDERS[1]]
+    level = about_y(torch.atan2(-left[..., 2], left[..., 0]))
+    rotations = torch.full((*targets.shape[:2], BODY_JOINTS, 3, 3), torch.nan)
+    for ankle in ANKLES:
+        height = at[ankle][..., 1]
+        low = height < height.quantile(0.05, dim=0) + LOW
+        rotations[:, :, ankle] = torch.where(low[..., None, None], level, torch.nan)
+    return rotations
 
 
 def _bridged(at: Floats, sure: Bools) -> Floats:

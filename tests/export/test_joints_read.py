@@ -74,6 +74,15 @@ def test_twelve_joints_of_a_tracker_are_people_in_any_unit_and_axis(
     assert f"unit {name}, {up} up, 30 fps" in got.notes[0] and "warning" not in got.notes[0]
 
 
+def test_feet_without_toes_are_level_on_the_floor(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    got = read(tracked(salsa, body, tmp_path / "a.csv"), options=Reading(keep_floor=True))
+    toes, heels = ([JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right")] for part in ("foot", "ankle"))
+    for scene in (got.scene, salsa):  # of a body at rest toes are 5 cm lower
+        joints = body.joints(scene)[0]
+        drop = (joints[:, :, heels, 1] - joints[:, :, toes, 1])[joints[:, :, heels, 1] < 0.10]
+        assert len(drop) > 50 and 0.02 < float(drop.median()) < 0.08
+
+
 def test_joints_that_are_lost_are_bridged_and_frames_without_hips_are_not_valid(
     salsa: Scene, body: Body, tmp_path: Path
 ) -> None:
