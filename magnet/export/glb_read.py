@@ -12,7 +12,7 @@ import numpy as np
 
 from magnet.export.cutting import kept_frames
 from magnet.export.gltf_file import DEFAULTS, GltfFile, matrices, sampled
-from magnet.export.rig_motion import Floats, RigMotion, rest_of, usual_rate
+from magnet.export.rig_motion import FARTHEST, Floats, RigMotion, rest_of, usual_rate
 from magnet.motion.scene import FPS
 
 FEWEST_BONES = 12
@@ -39,6 +39,7 @@ class Track:
 Tracks = dict[tuple[int, str], Track]
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged numbers are refused, without numpy's warnings
 def read_glb(path: str | Path, start: int = 0, end: int | None = None) -> list[RigMotion]:
     """Read all people of one GLB file.
 
@@ -158,6 +159,8 @@ def _clock(tracks: Sequence[Track]) -> tuple[Floats, float, list[str]]:
     if not moving:
         return np.zeros(1), FPS, ["nothing moves in it: a pose"]
     keys = max(moving, key=lambda track: len(track.keys)).keys
+    if not (np.diff(keys) > 0).all():
+        raise ValueError("its keys are not in order")
     step = float(np.median(np.diff(keys)))
     frames = np.diff(keys) / step
     first, last = (float(end([end(track.keys) for track in moving])) for end in (min, max))
@@ -213,6 +216,8 @@ def _person(
     nearest = [next((number[up] for up in file.above(node) if up in number), -1) for node in joints]
     T = len(world.at)
     moved = np.stack([np.broadcast_to(world(node), (T, 4, 4)) for node in joints], axis=1)  # (T, K, 4, 4)
+    if not np.abs(moved).max() < FARTHEST:
+        raise ValueError(f"a joint is {np.abs(moved).max():.2g} away: it is damaged")
     bound = _bound(file, world, joints)
     turned = _turn(moved[..., :3, :3]) @ np.swapaxes(_turn(bound[:, :3, :3]), -1, -2)
     at, rest = moved[..., :3, 3], bound[:, :3, 3]

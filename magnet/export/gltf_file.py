@@ -69,7 +69,7 @@ class GltfFile:
         data = self._buffer(view["buffer"])
         try:
             values = np.ndarray((accessor["count"], width), kind, data, begin, (stride, kind.itemsize))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise IndexError(f"numbers {index} lie outside the file") from error
         with np.errstate(invalid="ignore"):  # NaN of another kind: it is refused below
             values = values.astype(np.float64)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.rig_motion import Floats, usual_rate
+from magnet.export.rig_motion import FARTHEST, Floats, usual_rate
 from magnet.files import regular
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
@@ -75,6 +75,9 @@ def read_table(path: str | Path) -> JointTable:
             raise ValueError(f"{path}, line {number + 2}: a second row{who} for frame {t}; is a column person missing?")
         seen.add((t, person))
         at[t, people.index(person)] = numbers[number][where]
+    at[~np.isfinite(at)] = np.nan
+    if (at > FARTHEST).any() or (at < -FARTHEST).any():
+        raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
     fps = None if time_at is None else _rate(numbers[:, time_at], frame)
     return JointTable(tuple(columns), people, at, fps, unit)
 
@@ -117,8 +120,8 @@ def _frames(path: Path, numbers: Floats, column: int | None, told: Sequence[str]
             count[person] += 1
         return np.array(frames)
     said = numbers[:, column]
-    if not (np.isfinite(said) & (said == np.round(said))).all():
-        raise ValueError(f"{path}: frame {said[~(said == np.round(said))][0]:g}: expected whole numbers")
+    if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:
+        raise ValueError(f"{path}: frame {wrong[0]:g}: expected whole numbers")
     if said.max() - said.min() >= LONGEST:
         raise ValueError(f"{path}: frames {said.min():.0f} to {said.max():.0f}, more than is read ({LONGEST})")
     return (said - said.min()).astype(int)

@@ -48,6 +48,8 @@ def test_rows_of_people_and_frames_may_come_in_any_order_and_some_be_missing(sig
         (["a_x,a_y,a_z", "1,2"], "line 2: 2 cells, fewer than names"),
         (["frame,a_x,a_y,a_z", "1,0,0,0", "1,0,0,0"], "line 3: a second row for frame 0; is a column person missing"),
         (["frame,a_x,a_y,a_z", "0.5,0,0,0"], "frame 0.5: expected whole numbers"),
+        (["frame,a_x,a_y,a_z", "nan,0,0,0"], "frame nan: expected whole numbers"),
+        (["a_x,a_y,a_z", "0,1e9,0"], r"a joint is 1e\+09 away: numbers are damaged"),
         (["frame,a_x,a_y,a_z", "0,0,0,0", "1e9,0,0,0"], "frames 0 to 1000000000, more than is read"),
         (["scene,a_x,a_y,a_z", "0,0,0,0", "1,0,0,0"], "holds 2 scenes; keep the rows of one"),
         (["a_x_m,a_y_m,a_z_m,b_x_cm,b_y_cm,b_z_cm", "0,0,0,0,0,0"], "its columns are in different units"),
