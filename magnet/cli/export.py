@@ -30,6 +30,7 @@ for example:
   magnet export duet.npz leader.glb --person 0
   magnet export duet.npz duet.fbx --names mixamo
   magnet export edited.glb duet.npz                      # back from Blender
+  magnet export duet.npz dance.glb --rig hero.glb        # your own characters dance: dance_person0.glb ...
   magnet export upstairs.npz duet.npz --on_floor
 """
 
@@ -55,6 +56,11 @@ def parser() -> argparse.ArgumentParser:
     add("--root", choices=("floor", "none"), default="floor", help=root)
     clips = "one animation of a .glb for all, or one for each person"
     add("--clips", choices=("scene", "person"), default="scene", help=clips)
+    own = options.add_argument_group("onto characters of your own, a file a person")
+    rigs = "a character that is moved, of OUT's suffix: .glb, .fbx or .bvh; one for all, or one for each person"
+    own.add_argument("--rig", nargs="+", default=[], metavar="FILE", help=rigs)
+    theirs = "left_hip=Thigh_L, where the character's names say nothing"
+    own.add_argument("--rig_joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
     pictures = options.add_argument_group("pictures, films and pages")
     context = "first frames, from --start on, that a model was given, in files that do not say"
     pictures.add_argument("--context", type=int, default=0, metavar="FRAMES", help=context)
@@ -95,7 +101,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         raise CommandError(
             f"--context {options.context}: got {scene.frames} frames, so at most {scene.frames} were given"
         )
-    scene_files.require_unread(out, options.inputs, scene_files.slots_of(scene), options.smplx, options.each)
+    apart = (options.smplx, options.each, bool(options.rig))
+    scene_files.require_unread(out, [*options.inputs, *options.rig], scene_files.slots_of(scene), *apart)
     print(described(scene))
     if options.smplx and is_open(got.body):
         print("shapes of the open body mean nothing to SMPL-X: betas are zero, and transl is that of its mean shape")
@@ -113,6 +120,8 @@ def main(arguments: Sequence[str] = ()) -> int:
         size=tuple(options.size),
         progress=True,
         bones=BoneOptions(options.names, options.root, options.clips),
+        rigs=options.rig,
+        rig_joints=dict(pair.partition("=")[::2] for pair in options.rig_joint),
     )
     scene_files.say_written(written)
     return 0
@@ -128,6 +137,11 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
 
     shown = (".html", ".png", *PICTURES)
     bones = (".glb", ".fbx", *USD)
+    if options.rig_joint and not options.rig:
+        raise CommandError("--rig_joint: names joints of a character, which --rig names")
+    for name, usual in (("unit", "m"), ("names", "smplx"), ("root", "floor"), ("clips", "scene")):
+        if options.rig and getattr(options, name) != usual:
+            raise CommandError(f"--{name}: a character has its own; leave it out beside --rig")
     if options.each and not options.smplx:
         raise CommandError("--each: a file per person is for --smplx")
     for flag, plain, takes in (
@@ -136,6 +150,7 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
         ("names", "smplx", (".bvh", *bones)),
         ("root", "floor", bones),
         ("clips", "scene", (".glb",)),
+        ("rig", [], (".glb", ".fbx", ".bvh")),
         ("context", 0, shown),
         ("style", "body", shown),
         ("size", FILM, PICTURES),

@@ -162,7 +162,12 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 
 
 def require_unread(
-    path: Path, inputs: Sequence[str], people: Sequence[int | Sequence[int]], smplx: bool = False, each: bool = False
+    path: Path,
+    inputs: Sequence[str],
+    people: Sequence[int | Sequence[int]],
+    smplx: bool = False,
+    each: bool = False,
+    rigs: bool = False,
 ) -> None:
     """Refuse to write over an input, which may be somebody's only recording: OUT itself, or a file of OUT's people.
 
@@ -170,7 +175,7 @@ def require_unread(
         path: OUT.
         inputs: files that are read.
         people: slots of who is there in each scene that is written, or how many, who then have the first ones.
-        smplx, each: as for `formats.write`.
+        smplx, each, rigs: as for `formats.files_of`.
 
     Raises:
         CommandError: names the input.
@@ -179,7 +184,7 @@ def require_unread(
 
     read = [source for source in map(Path, inputs) if source.exists()]
     slots = [range(there) if isinstance(there, int) else there for there in people]
-    for file in formats.files_of(path, slots, smplx, each):
+    for file in formats.files_of(path, slots, smplx, each, rigs):
         for source in read if file.exists() else ():
             if not file.samefile(source):
                 continue

@@ -64,7 +64,7 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
         raise ValueError("nobody is present in the scene, so there is no skeleton to write")
     path = Path(path)
     written = []
-    for p, each in enumerate(paths_of(path, scene.present[0].nonzero()[:, 0].tolist())):
+    for p, each in enumerate(paths_of(path.with_suffix(".bvh"), scene.present[0].nonzero()[:, 0].tolist())):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)
@@ -82,7 +82,6 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
 
 def paths_of(path: Path, slots: Sequence[int]) -> list[Path]:
     """The files of people in these slots: out_person0.bvh, out_person1.bvh ..., or the path itself for one person."""
-    path = path.with_suffix(".bvh")
     return [path] if len(slots) == 1 else [person_file(path, slot) for slot in slots]
 
 

@@ -52,11 +52,22 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     blender()
     path = Path(path) if Path(path).suffix.lower() == ".fbx" else Path(path).with_suffix(".fbx")
     with tempfile.TemporaryDirectory() as folder:
-        glb, made = save_glb(scene, Path(folder) / "scene.glb", body, bones), Path(folder) / "scene.fbx"
-        _run(AS_FBX, glb, made, f"write {path}", f"{scene.fps:g}")
+        as_fbx(save_glb(scene, Path(folder) / "scene.glb", body, bones), path, scene.fps)
+    return path
+
+
+def as_fbx(glb: Path, path: Path, fps: float) -> None:
+    """Write a GLB as FBX, with a keyframe for every frame.
+
+    Raises:
+        ImportError: Blender is not here; says how to get it.
+        ValueError: Blender's own words where it fails.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "scene.fbx"
+        run_script(AS_FBX, glb, made, f"write {path}", f"{fps:g}")
         with whole(path) as part:
             shutil.copyfile(made, part)
-    return path
 
 
 def converted(fbx: Path, glb: Path) -> Path:
@@ -66,11 +77,11 @@ def converted(fbx: Path, glb: Path) -> Path:
         ImportError: Blender is not here; says how to get it.
         ValueError: Blender's own words where it fails.
     """
-    _run(AS_GLB, fbx, glb, f"read {fbx}")
+    run_script(AS_GLB, fbx, glb, f"read {fbx}")
     return glb
 
 
-def _run(script: Path, source: Path, made: Path, task: str, *words: str) -> None:
+def run_script(script: Path, source: Path, made: Path, task: str, *words: str) -> None:
     """Let Blender run a script that makes one file of another. task: what is to be done, for the error"""
     command = blender()
     words = (*command, str(script), "--", str(source.resolve()), str(made), *words)

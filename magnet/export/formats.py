@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
+from magnet.export.onto_rig import RigOptions, save_onto
 from magnet.export.usd import require_usd, save_usd
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, require_rotations
@@ -152,6 +154,8 @@ def write(
     bones: BoneOptions = BoneOptions(),
     size: Size = FILM,
     each: bool = False,
+    rigs: Sequence[str | Path] = (),
+    rig_joints: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write a scene in the format of the path's suffix.
 
@@ -170,6 +174,7 @@ def write(
         bones: names and hierarchy of bones in GLB, FBX and USD; their names in BVH.
         size: pixels of a film's panel, width and height, even numbers.
         each: with smplx, a file per person: out_person0.npz, out_person1.npz ...
+        rigs, rig_joints: characters of your own that are moved: see `magnet.export.onto_rig.save_onto`.
 
     Returns:
         The paths written.
@@ -198,10 +203,18 @@ def write(
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
     options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size, each)
-    places = places_of(path, scene.scenes, smplx)
+    places, make = places_of(path, scene.scenes, smplx), kind.write
+    if rigs:
+        make = functools.partial(_write_onto, rigs, RigOptions(joints=rig_joints))
     if len(places) == 1:
-        return list(kind.write(scene, path, options))
-    return [made for b, place in enumerate(places) for made in kind.write(scene.select([b]), place, options)]
+        return list(make(scene, path, options))
+    return [made for b, place in enumerate(places) for made in make(scene.select([b]), place, options)]
+
+
+def _write_onto(
+    rigs: Sequence[str | Path], how: RigOptions, scene: Scene, path: Path, o: WriteOptions
+) -> Sequence[Path]:
+    return save_onto(scene, path, o.body, rigs, how)
 
 
 def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
@@ -215,12 +228,14 @@ def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
     return [path.with_name(f"{path.stem}_scene{b}{path.suffix.lower()}") for b in range(scenes)]
 
 
-def files_of(path: Path, slots: Sequence[Sequence[int]], smplx: bool = False, each: bool = False) -> list[Path]:
+def files_of(
+    path: Path, slots: Sequence[Sequence[int]], smplx: bool = False, each: bool = False, rigs: bool = False
+) -> list[Path]:
     """The files that `write` writes, known before there is a scene. slots: of who is there in each scene"""
     places = places_of(path, len(slots), smplx)
     if smplx and each:
         return [file for place, there in zip(places, slots, strict=True) for file in each_of(place, there)]
-    if path.suffix.lower() != ".bvh":
+    if path.suffix.lower() != ".bvh" and not rigs:
         return places
     return [file for place, there in zip(places, slots, strict=True) for file in paths_of(place, there)]
 

@@ -245,14 +245,19 @@ class Gltf:
             clip["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
 
     def packed(self) -> bytes:
-        """The file: header, JSON padded with spaces, buffer padded with zeros."""
-        self.document["buffers"] = [{"byteLength": len(self.binary)}]
-        held = {key: value for key, value in self.document.items() if value != []}  # glTF has no empty lists
-        text = json.dumps(held, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
-        total = 12 + 8 + len(text) + 8 + len(self.binary)
-        head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
-        return head + text + struct.pack("<I4s", len(self.binary), b"BIN\0") + bytes(self.binary)
+        """The file."""
+        return packed(self.document, self.binary)
+
+
+def packed(document: dict[str, Any], binary: bytearray) -> bytes:
+    """A document and its one buffer as a file: header, JSON padded with spaces, buffer padded with zeros."""
+    held = {key: value for key, value in document.items() if value != []}  # glTF has no empty lists
+    data = bytes(binary) + bytes(-len(binary) % 4)
+    text = json.dumps(held | {"buffers": [{"byteLength": len(data)}]}, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + len(data)
+    head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
 
 def unbroken(quaternions: Tensor) -> Tensor:

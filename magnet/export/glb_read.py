@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from magnet.export.cutting import kept_frames
 from magnet.export.gltf_file import DEFAULTS, GltfFile, matrices, sampled
+from magnet.export.rig import people_of
 from magnet.export.rig_motion import FARTHEST, Floats, RigMotion, rest_of, usual_rate
 from magnet.motion.scene import FPS
 
@@ -57,23 +59,70 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None) -> list[R
     """
     path = Path(path)
     file = GltfFile(path)
-    try:
+    with _in_one_line(path):
         people = _people(file)
         tracks, notes = _tracks(file)
         at, fps, also = _clock([track for (node, _), track in tracks.items() if _moves(file, node, people)])
         kept = kept_frames(path, len(at), start, end)
         world = _World(file, tracks, at[kept])
         return [_person(file, world, joints, fps, (*notes, *also), len(people) > 1) for joints in people]
+
+
+@contextmanager
+def _in_one_line(path: Path) -> Iterator[None]:
+    """Errors of damaged files, with the file's name."""
+    try:
+        yield
     except (KeyError, IndexError, TypeError, AttributeError, np.linalg.LinAlgError) as error:
         raise ValueError(f"{path}: its parts do not go together ({error!r}): export it again") from error
     except ValueError as error:
         raise ValueError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from error
 
 
+@dataclass(frozen=True)
+class GlbRig:
+    """A character: its file, its skeleton as it rests, and where its joints are in the file.
+
+    Attributes:
+        joints: nodes of the skeleton's joints.
+        turn: (K, 3, 3) world rotations of these nodes in the skeleton's rest pose.
+    """
+
+    file: GltfFile
+    rig: RigMotion
+    joints: tuple[int, ...]
+    turn: Floats
+
+    def at_rest(self, node: int) -> Floats:
+        """Where a node is when nothing moves. -> (4, 4)"""
+        return _World(self.file, {}, np.zeros(1)).at_rest(node)
+
+
+def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig:
+    """The one character of a GLB file, which need not move.
+
+    Args:
+        given: our joint's name to its own, for names that no scheme knows.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: as `read_glb`, or several people.
+    """
+    file = GltfFile(Path(path))
+    with _in_one_line(file.path), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        groups, still = _people(file, needs_motion=False), _World(file, {}, np.zeros(1))
+        rigs = [_person(file, still, joints, FPS, (), len(groups) > 1) for joints in groups]
+        people = [rig.person for rig in people_of(rigs, given)]
+        if len(people) > 1:
+            raise ValueError(f"holds {', '.join(people)}: expected one character; export each to a file of its own")
+        k = [rig.person for rig in rigs].index(people[0])
+        return GlbRig(file, rigs[k], tuple(groups[k]), _turn(_bound(file, still, groups[k])[:, :3, :3]))
+
+
 # -- who is there ------------------------------------------------------------------------------
 
 
-def _people(file: GltfFile) -> list[list[int]]:
+def _people(file: GltfFile, needs_motion: bool = True) -> list[list[int]]:
     """The joints of each person, each behind its parent, one root first.
 
     Raises:
@@ -90,7 +139,7 @@ def _people(file: GltfFile) -> list[list[int]]:
         tops = [k for k in range(len(file.nodes)) if k not in file.parents]
         moved = {channel["target"].get("node") for each in _animations(file) for channel in each["channels"]}
         trees = [set(file.below(top)) for top in tops]
-        groups = [tree for tree in trees if len(tree) >= FEWEST_BONES and tree & moved]
+        groups = [tree for tree in trees if len(tree) >= FEWEST_BONES and (tree & moved or not needs_motion)]
     if not groups:
         raise ValueError("holds no skeleton: neither a skin with joints, nor a tree of nodes that moves")
     return [_in_order(file, group) for group in groups]
@@ -231,7 +280,7 @@ def _person(
     offsets *= _scale(place, offsets, nearest)
     person = _named(file, joints) if several else ""
     names = tuple(map(file.name, joints))
-    told: dict[str, Any] = {"up": "y", "person": person, "notes": tuple(notes)}
+    told: dict[str, Any] = {"up": "y", "unit": "m", "person": person, "notes": tuple(notes)}
     return RigMotion(names, tuple(nearest), offsets, place, local, fps, file.path, **told)
 
 

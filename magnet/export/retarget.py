@@ -297,6 +297,15 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
     A bone that rests otherwise than ours is first swung to where theirs rests, its parent's swing included. rest
     (22, 3) -> (T, 22, 3, 3)
     """
+    aligned, source = rests_aligned(skeleton, rest), sources(skeleton)
+    known = torch.full((skeleton.file.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
+    for j, k in source.items():
+        known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
+    return known, source
+
+
+def rests_aligned(skeleton: Skeleton, rest: Tensor) -> dict[int, Tensor]:
+    """Rotations (3, 3) from our rest pose, rest (22, 3), to where a skeleton's bones rest; NaN: it does not tell."""
     ours, theirs = skeleton.naming.joints, torch.from_numpy(skeleton.file.rest())
     Q = torch.from_numpy(skeleton.R_rest_ours)
     aligned = {j: Q for j in range(BODY_JOINTS)}
@@ -315,13 +324,15 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
                 aligned[j] = torch.full_like(Q, torch.nan)
     for s in (0, 1):
         aligned[TOES[s]], aligned[WRISTS[s]] = aligned[ANKLES[s]], aligned[ELBOWS[s]]
+    return aligned
+
+
+def sources(skeleton: Skeleton) -> dict[int, int]:
+    """Which joint of a skeleton turns as each of ours does."""
     used = dict(zip(*_spine(len(skeleton.chain)), strict=True))
     source = {joint: skeleton.chain[place] for joint, place in used.items()}
-    source |= {j: k for j, k in ours.items() if j not in COLLARS}  # collars differ most of all from rig to rig
-    known = torch.full((skeleton.file.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
-    for j, k in source.items():
-        known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
-    return known, source
+    # Collars differ most of all from rig to rig.
+    return source | {j: k for j, k in skeleton.naming.joints.items() if j not in COLLARS}
 
 
 def _spine(bones: int) -> tuple[list[int], list[int]]:

@@ -115,7 +115,8 @@ def _leg(rest: Floats, ours: Mapping[int, int]) -> float:
 
 
 def _units(files: Sequence[RigMotion], legs: Sequence[float]) -> list[str]:
-    """One unit for all, which fits most legs and makes the others a child's or a giant's; else each file's own."""
+    """One unit for all, which fits most legs and makes the others a child's or a giant's; else each file's own, which
+    its format says where nothing fits."""
 
     def fits(leg: float, unit: str, low: float = SHORTEST_LEG, high: float = LONGEST_LEG) -> bool:
         return low <= leg * UNITS[unit] <= high
@@ -124,7 +125,10 @@ def _units(files: Sequence[RigMotion], legs: Sequence[float]) -> list[str]:
     unit = max(shared, key=lambda unit: sum(fits(leg, unit) for leg in legs), default=None)
     if unit is not None and any(fits(leg, unit) for leg in legs):
         return [unit] * len(files)
-    own = [next((unit for unit in UNITS if fits(leg, unit)), "") for leg in legs]
+    own = [
+        next((unit for unit in UNITS if fits(leg, unit)), file.unit or "")
+        for file, leg in zip(files, legs, strict=True)
+    ]
     if "" in own:
         k = own.index("")
         raise ValueError(

@@ -32,6 +32,7 @@ class RigMotion:
     path: Path
     tracked: Bools | None = None  # (T,) frames that hold no NaN; the others are as the one before
     up: str | None = None  # the axis that the format has up; None: any
+    unit: str | None = None  # the format's, which programs do not all keep; None: any
     person: str = ""  # who it is, in a file of several people
     notes: tuple[str, ...] = ()  # on how it was read
 
