@@ -109,9 +109,9 @@ def save_onto(
 def moved_as(scene: Scene, body: Body, skeleton: Skeleton) -> Moved:
     """A skeleton that moves as the one person of a scene."""
     M = UP[skeleton.up]
-    aligned, source = rests_aligned(skeleton, body.rest_joints(torch.zeros(10)).double()), sources(skeleton)
-    rest_ours = body.rest_joints(scene.betas[:, None].cpu())
-    R, at = body.bone_chain(scene.body_rot[0, :, 0].cpu(), scene.T_world_root[0, :, 0].cpu(), rest_ours[0, 0])
+    rest_ours = body.rest_joints(scene.betas[0, 0].cpu())
+    aligned, source = rests_aligned(skeleton, rest_ours.double()), sources(skeleton)
+    R, at = body.bone_chain(scene.body_rot[0, :, 0].cpu(), scene.T_world_root[0, :, 0].cpu(), rest_ours)
     turned = {
         k: M.T @ R[:, j].double().numpy() @ aligned[j].T.numpy()
         for j, k in (source | {j: skeleton.naming.joints[j] for j in COLLARS if j in skeleton.naming.joints}).items()
