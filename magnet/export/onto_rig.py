@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ from magnet.export.glb import FLOAT, animation, frame_times, packed, standing, u
 from magnet.export.glb_read import GlbRig, read_rig
 from magnet.export.gltf_file import matrices
 from magnet.export.retarget import rests_aligned, sources
-from magnet.export.rig import UP, Skeleton, understood
+from magnet.export.rig import UP, Skeleton, rest_frame, understood
 from magnet.export.rig_motion import Floats, RigMotion
 from magnet.files import whole, write_text
 from magnet.motion.bvh import bvh_header
 from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import to_quat
-from magnet.motion.scene import Scene
+from magnet.motion.scene import BODY_JOINTS, Scene
 
 FLOOR = 0.15
 """Metres over 0 up to which the lowest joint of a rest pose may be for 0 to be its floor."""
@@ -110,6 +110,9 @@ def moved_as(scene: Scene, body: Body, skeleton: Skeleton) -> Moved:
     """A skeleton that moves as the one person of a scene."""
     M = UP[skeleton.up]
     rest_ours = body.rest_joints(scene.betas[0, 0].cpu())
+    # Large shape numbers make a body lean as it rests: it counts from there, too.
+    leans = rest_frame(rest_ours.double().numpy(), {j: j for j in range(BODY_JOINTS)}, skeleton.file.path)
+    skeleton = replace(skeleton, R_rest_ours=skeleton.R_rest_ours @ leans.T)
     aligned, source = rests_aligned(skeleton, rest_ours.double()), sources(skeleton)
     R, at = body.bone_chain(scene.body_rot[0, :, 0].cpu(), scene.T_world_root[0, :, 0].cpu(), rest_ours)
     turned = {

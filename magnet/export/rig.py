@@ -186,7 +186,7 @@ def _skeleton(
         unit=unit,
         up=up,
         metres=UNITS[unit],
-        R_rest_ours=_rest_frame(file.rest(), ours, file.path),
+        R_rest_ours=rest_frame(file.rest(), ours, file.path),
         turned=M @ turned,
         at=UNITS[unit] * (at @ M.T),
         chain=tuple(reversed(chain)) if chain[-1] == pelvis else (pelvis,),
@@ -198,7 +198,8 @@ def _middle(at: Floats, ours: Mapping[int, int], a: int, b: int) -> Floats:
     return (at[..., ours[a], :] + at[..., ours[b], :]) / 2
 
 
-def _rest_frame(rest: Floats, ours: Mapping[int, int], path: Path) -> Floats:
+def rest_frame(rest: Floats, ours: Mapping[int, int], path: Path) -> Floats:
+    """Rotation from our rest frame (left +x, up +y) to that of a rest pose. rest (K, 3) -> (3, 3)"""
     hips, shoulders = (rest[ours[left]] - rest[ours[right]] for left, right in (HIPS, SHOULDERS))
     left = hips / 2 + shoulders / 2
     above = _middle(rest, ours, *SHOULDERS) - _middle(rest, ours, *HIPS)

@@ -100,7 +100,7 @@ def test_a_rest_pose_with_arms_down_is_no_other_motion(salsa: Scene, body: Body,
 
 
 def test_who_has_a_characters_proportions_moves_it_exactly(salsa: Scene, body: Body, tmp_path: Path) -> None:
-    shape = (2.0, -2.0, 1.0)
+    shape = (4.0, -2.0, 1.0)  # which leans
     tall = salsa.replace(betas=torch.tensor([*shape, *[0.0] * 7]).expand_as(salsa.betas).clone())
     rig = save_glb(someone(salsa, shape), tmp_path / "rig.glb", body)
     assert off(save_onto(tall, tmp_path / "out.glb", body, [rig]), tall, body) < 2e-4
