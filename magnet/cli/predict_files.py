@@ -51,6 +51,8 @@ OF_EXPORT = (
     "--names",
     "--root",
     "--clips",
+    "--rig",
+    "--rig_joint",
     "--unit",
     "--smplx",
     "--each",
