@@ -177,6 +177,8 @@ def _skeleton(
     ours, M = naming.joints, UP[up]
     pelvis = _ancestor(file.parents, [ours[1], ours[2]])
     chest = _ancestor(file.parents, [ours[16], ours[17]])
+    if pelvis not in _line(file.parents, chest):  # legs and spine hang beside each other, as Daz's do
+        pelvis = _ancestor(file.parents, [pelvis, chest])
     chain = [chest]
     while chain[-1] != pelvis and file.parents[chain[-1]] >= 0:
         chain.append(file.parents[chain[-1]])
@@ -215,12 +217,13 @@ def rest_frame(rest: Floats, ours: Mapping[int, int], path: Path) -> Floats:
 
 def _ancestor(parents: Sequence[int], joints: Sequence[int]) -> int:
     """Lowest joint that all of them hang on."""
+    common = set(_line(parents, joints[0])).intersection(*(_line(parents, k) for k in joints[1:]))
+    return next(k for k in _line(parents, joints[0])[1:] if k in common)
 
-    def line(k: int) -> list[int]:
-        up = [k]
-        while parents[up[-1]] >= 0:
-            up.append(parents[up[-1]])
-        return up
 
-    common = set(line(joints[0])).intersection(*(line(k) for k in joints[1:]))
-    return next(k for k in line(joints[0])[1:] if k in common)
+def _line(parents: Sequence[int], k: int) -> list[int]:
+    """A joint and all that it hangs on."""
+    up = [k]
+    while parents[up[-1]] >= 0:
+        up.append(parents[up[-1]])
+    return up

@@ -19,7 +19,7 @@ from magnet.export.gltf_file import GltfFile
 from magnet.export.onto_rig import save_onto
 from magnet.export.reading import Reading, read
 from magnet.motion.scene import Scene
-from tests.export import strangers
+from tests.export import glb_strangers, strangers
 from tests.export.test_glb_read import Z_UP_CENTIMETRES, stranger
 
 
@@ -75,6 +75,32 @@ def test_a_bvh_keeps_its_names_unit_and_end_sites(unit: str, salsa: Scene, body:
     assert off(paths, salsa, body) < 1e-4
     heads = [path.read_text().partition("MOTION")[0].split() for path in (rig, paths[0])]
     assert heads[0] == heads[1]
+
+
+def test_legs_and_spine_may_hang_beside_each_other(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    """As of Daz and Character Creator, whose root holds a pelvis with the legs, and beside it the spine."""
+    one = salsa.people().select([0])
+    rest = body.rest_joints(torch.zeros(10)).double().numpy()
+    turned, at = (
+        x.double().numpy()
+        for x in body.bone_chain(one.body_rot[0, :, 0], one.T_world_root[0, :, 0], body.rest_joints(torch.zeros(10)))
+    )
+    names = ["hip", *(strangers.NAMINGS["mixamo"][name] for name in JOINT_NAMES)]
+    parents = [-1, 0, *(parent + 1 for parent in PARENTS[1:])]
+    parents[1 + JOINT_NAMES.index("spine1")] = 0
+    twice = [np.concatenate([x[..., :1, :, :], x], axis=-3) for x in (turned, at[..., None], rest[..., None])]
+    glb = glb_strangers.Written()
+    keys = np.arange(one.frames) / 30
+    glb_strangers.person(glb, names, parents, twice[0], twice[1][..., 0], twice[2][..., 0], keys)
+    path = glb.save(tmp_path / "rig.glb")
+    plain = Reading(keep_floor=True)
+    for paths in ([path], save_onto(one, tmp_path / "out.glb", body, [path])):
+        got = read(paths, options=plain).scene
+        assert float((body.joints(got) - body.joints(one)).norm(dim=-1).max()) < 0.03
+    chest, pelvis = (one.frames // 2, JOINT_NAMES.index("spine3")), JOINT_NAMES.index("pelvis")
+    away = body.joints(got)[0, chest[0], 0, chest[1]] - body.joints(got)[0, chest[0], 0, pelvis]
+    true = body.joints(one)[0, chest[0], 0, chest[1]] - body.joints(one)[0, chest[0], 0, pelvis]
+    assert float((away - true).norm()) < 0.02
 
 
 def test_a_rest_pose_with_arms_down_is_no_other_motion(salsa: Scene, body: Body, tmp_path: Path) -> None:
