@@ -121,7 +121,8 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
     """A path beside `path`, of the same suffix, that takes its place when the block ends well; its folder is made.
 
     So what was there before stays where the disk is full or somebody interrupts, and no half file is left. What is no
-    plain file, such as `/dev/null`, is written as it is, and so is a file in a folder that takes no other.
+    plain file, such as `/dev/null`, is written as it is, and so is a file in a folder that takes no other. A file that
+    is protected against writing stays, too: its own path is opened, which the system refuses.
 
     Args:
         path: the file that the block writes; of a link, the file that it leads to.
@@ -134,7 +135,8 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
     with writing(path, advice):
         path.parent.mkdir(parents=True, exist_ok=True)
         target = Path(os.path.realpath(path))
-        if target.exists() and not (target.is_file() and os.access(target.parent, os.W_OK)):
+        # Of the path and not of the target, which a pipe behind /dev/stdout does not have.
+        if path.exists() and not (path.is_file() and os.access(target, os.W_OK) and os.access(target.parent, os.W_OK)):
             yield path
             return
         part = target.with_name(f".{secrets.token_hex(8)}.part{target.suffix}")
@@ -143,6 +145,10 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
             if target.exists():
                 shutil.copymode(target, part)
             part.replace(target)
+        except OSError as error:
+            if str(error.filename) == str(part):
+                error.filename = str(path)  # the name that is known outside
+            raise
         finally:
             part.unlink(missing_ok=True)
 

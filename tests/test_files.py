@@ -143,6 +143,36 @@ def test_what_is_no_plain_file_is_written_as_it_is() -> None:
         assert part == Path("/dev/null")
 
 
+def test_a_pipe_that_a_path_leads_to_is_written_as_it_is() -> None:
+    if not Path("/dev/fd").is_dir():
+        pytest.skip("no /dev/fd here")
+    read_end, write_end = os.pipe()
+    try:
+        assert write_text(f"/dev/fd/{write_end}", "text") == Path(f"/dev/fd/{write_end}")  # as /dev/stdout behind a |
+        assert os.read(read_end, 99) == b"text"
+    finally:
+        os.close(read_end)
+        os.close(write_end)
+
+
+def test_a_file_that_is_protected_against_writing_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = write_text(tmp_path / "a", "before")
+    monkeypatch.setattr("os.access", lambda path, _: Path(path) != there)  # chmod would not stop an administrator
+    with whole(there) as part:
+        assert part == there  # which the system refuses to open
+
+
+def test_a_refused_file_is_told_by_the_name_that_was_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(CannotWrite, match=r"a\.txt: cannot be written \(") as caught, whole(tmp_path / "a.txt") as part:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(part))
+    assert ".part" not in str(caught.value)
+    with pytest.raises(FileNotFoundError) as other, whole(tmp_path / "a.txt"):
+        raise FileNotFoundError(errno.ENOENT, "no", "model.npz")
+    assert other.value.filename == "model.npz"
+
+
 def test_a_file_in_a_folder_that_takes_no_other_is_still_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
