@@ -49,13 +49,18 @@ def read_table(path: str | Path) -> JointTable:
     with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
         first = file.readline()
         file.seek(0)
-        rows = [row for row in csv.reader(file, delimiter=max(",;\t", key=first.count)) if any(map(str.strip, row))]
+        lines = csv.reader(file, delimiter=max(",;\t", key=first.count))
+        try:
+            rows = [row for row in lines if any(map(str.strip, row))]
+        except csv.Error as error:
+            raise ValueError(f"{path}, line {lines.line_num}: {error}; write it again as a table") from error
     if len(rows) < 2:
         raise ValueError(f"{path}: holds no rows under a line of names")
     head = [name.strip() for name in rows[0]]
     columns, unit = _columns(path, head)
+    words = [name.lower() for name in head]
     frame_at, time_at, person_at, scene_at = (
-        next((head.index(name) for name in head if name.lower() in names), None)
+        next((words.index(name) for name in names if name in words), None)  # the surest name first
         for names in (FRAME, TIME, PERSON, ("scene",))
     )
     numbers = np.array(
@@ -85,12 +90,13 @@ def read_table(path: str | Path) -> JointTable:
 def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str | None]:
     """The three columns of each joint, and the unit that they say."""
     found: dict[str, dict[str, int]] = {}
-    units = set()
+    said: dict[str, set[str | None]] = {}
     for k, name in enumerate(head):
         if (match := COLUMN.match(name)) and name.lower() not in (*FRAME, *TIME, *PERSON):
             found.setdefault(match[1], {})[match[2].lower()] = k
-            units.add(match[3].lower() if match[3] else None)
+            said.setdefault(match[1], set()).add(match[3].lower() if match[3] else None)
     whole = {name: [axes[axis] for axis in "xyz"] for name, axes in found.items() if len(axes) == 3}
+    units = set().union(*(said[name] for name in whole))  # a column `index`, which ends in x, is no joint's
     if not whole:
         raise ValueError(
             f"{path}: no columns of joints, such as left_hip_x_m, left_hip_y_m, left_hip_z_m; it has "

@@ -40,6 +40,14 @@ def test_rows_of_people_and_frames_may_come_in_any_order_and_some_be_missing(sig
     assert np.isnan(found.at[1, 0, 0, 0]) and found.at[1, 0, 0, 1] == 8 and np.isnan(found.at[1, 1]).all()
 
 
+def test_columns_that_merely_end_in_an_axis_or_could_be_a_person_are_passed_over(tmp_path: Path) -> None:
+    head = "id,timestamp,index,frame,person,time_s,a_x_m,a_y_m,a_z_m"
+    found = read_table(table(tmp_path / "a.csv", head, "7,0,0,0,A,0,1,2,3", "8,500,1,1,A,0.5,4,5,6"))
+    assert found.names == ("a",) and found.unit == "m" and found.people == ("A",) and found.fps == 2.0
+    assert found.at[:, 0, 0].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert read_table(table(tmp_path / "b.csv", "ID,a_x,a_y,a_z", "7,1,2,3", "8,4,5,6")).people == ("7", "8")
+
+
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
@@ -52,6 +60,7 @@ def test_rows_of_people_and_frames_may_come_in_any_order_and_some_be_missing(sig
         (["a_x,a_y,a_z", "0,1e9,0"], r"a joint is 1e\+09 away: numbers are damaged"),
         (["frame,a_x,a_y,a_z", "0,0,0,0", "1e9,0,0,0"], "frames 0 to 1000000000, more than is read"),
         (["scene,a_x,a_y,a_z", "0,0,0,0", "1,0,0,0"], "holds 2 scenes; keep the rows of one"),
+        (["a_x,a_y,a_z", '"' + "1" * 200_000], "line 2: field larger than field limit .* write it again as a table"),
         (["a_x_m,a_y_m,a_z_m,b_x_cm,b_y_cm,b_z_cm", "0,0,0,0,0,0"], "its columns are in different units"),
     ],
 )
