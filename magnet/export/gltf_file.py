@@ -126,7 +126,9 @@ class GltfFile:
         if "matrix" in said:
             matrix = np.array(said["matrix"], dtype=np.float64).reshape(4, 4).T
             scale = np.linalg.norm(matrix[:3, :3], axis=0)
-            quat = to_quat(torch.from_numpy(matrix[:3, :3] / np.maximum(scale, 1e-12))).numpy()
+            if np.linalg.det(matrix[:3, :3]) < 0:  # it mirrors: what is left is a rotation
+                scale = -scale
+            quat = to_quat(torch.from_numpy(matrix[:3, :3] / np.where(scale, scale, 1e-12))).numpy()
             return {"translation": matrix[:3, 3], "rotation": quat, "scale": scale}
         return {what: np.array(said.get(what, usual), dtype=np.float64) for what, usual in DEFAULTS.items()}
 

@@ -197,6 +197,10 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
         (lambda d: d.update(nodes=7), "its parts do not go together"),
         (lambda d: d["bufferViews"][1].update(byteOffset=2**63), "its parts do not go together"),
         (lambda d: d["nodes"][0].update(scale=[1e308, 1, 1]), "it is damaged|a bone is mirrored, flat or skewed"),
+        (
+            lambda d: d["nodes"][0].update(matrix=[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
+            "a bone is mirrored, flat or skewed",
+        ),
         (lambda d: d["nodes"][0].update(translation=[1e9, 0, 0]), r"a joint is 1e\+09 away: it is damaged"),
         (lambda d: d["accessors"][0].update(count=0), "a translation has no frames"),
         (lambda d: d["accessors"][2].update(type="VEC3"), "a rotation has 3 numbers, expected 4"),
