@@ -90,7 +90,10 @@ def ours(data: Any) -> bool:
         return bool(data) and all(map(ours, data))
     if not isinstance(data, dict) or "class_path" not in data:
         return False
-    name, said = data["class_path"].rpartition(".")[2], data.get("init_args") or {}
+    package, name = str(data["class_path"]).partition(".")[0], str(data["class_path"]).rpartition(".")[2]
+    if package not in (name, "magnet"):  # a data set of another package may have the name of one of ours
+        return False
+    said = data.get("init_args") or {}
     if name == "CMU":
         takes = {f"{take:02d}" for key in ("test_takes", "val_takes") for take in said.get(key, ())}
         return takes == set(HELD_OUT) and not said.get("path")

@@ -260,4 +260,6 @@ def test_what_weights_were_trained_on_is_only_told_of_the_data_that_it_is_known_
     taken = {**CMU, "init_args": {"test_takes": [5], "val_takes": [3]}}
     store = {**CMU, "init_args": {**CMU["init_args"], "path": "store"}}
     duobox = {"class_path": "magnet.datamodules.DuoBox", "init_args": {"path": "store"}}
-    assert not any(map(record.ours, (taken, store, duobox, [CMU, duobox], [], None, {})))
+    namesakes = [{**each, "class_path": f"lab.{each['class_path'].rpartition('.')[2]}"} for each in (CMU, SYNTHETIC)]
+    assert not any(map(record.ours, (taken, store, duobox, *namesakes, [CMU, duobox], [], None, {})))
+    assert record.ours({**CMU, "class_path": "CMU"})  # as a file may name it
