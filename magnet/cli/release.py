@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     folder: Path = given.folder / given.name
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
         raise CommandError(f"{folder} is a folder of other files; choose another name, or another --folder")
-    from magnet.files import require_place
+    from magnet.files import require_place, write_text
 
     require_place(folder / "config.json")
     from magnet import checkpoints
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     checkpoints.write(checkpoint | plain, folder, record)
     parts = [part.stat().st_size for part in folder.glob("*.safetensors")]
     if not (folder / "README.md").exists():
-        (folder / "README.md").write_text(card(given.name, record, sum(parts)), encoding="utf-8")
+        write_text(folder / "README.md", card(given.name, record, sum(parts)))
     sizes = [f"{size / 1e6:.1f} MB" for size in (sum(parts), path.stat().st_size)]
     print(f"{folder}: {len(parts)} parts, {sizes[0]} (the checkpoint: {sizes[1]})")
     print(summary(record))

@@ -13,6 +13,7 @@ import torch
 
 import magnet
 from magnet import checkpoints, cli
+from magnet.cli import release
 from magnet.cli import release_record as record
 from magnet.cli.release_decoder import decoder_kept, with_decoder
 from magnet.testing import tiny_denoiser
@@ -67,6 +68,18 @@ def test_fine_tuned_weights_say_what_they_started_from_and_what_that_owes(
     for words in ("ten hours of duets / ours", "duet (sha256 ", record.ACKNOWLEDGEMENT, "CC-BY-4.0", "open-1"):
         assert words in told and words in card
     assert "(the checkpoint: " in told
+
+
+def test_a_card_that_could_not_be_written_whole_is_written_by_the_next_release(
+    tuned: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(record, "card", lambda *_: "half \udce9")  # which no file takes
+        with pytest.raises(UnicodeEncodeError):
+            release.main(["last", "mine", *SAID])
+    assert not Path("mine/README.md").exists()
+    assert cli.main(["release", "last", "mine", *SAID]) == 0
+    assert "ten hours of duets" in Path("mine/README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/own.md"])
