@@ -146,9 +146,9 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
                 shutil.copymode(target, part)
             part.replace(target)
         except OSError as error:
-            if str(error.filename) == str(part):
-                error.filename = str(path)  # the name that is known outside
-            raise
+            if str(error.filename) != str(part):
+                raise
+            raise OSError(error.errno, error.strerror, str(path)) from error  # by the name that is known outside
         finally:
             part.unlink(missing_ok=True)
 
