@@ -31,6 +31,8 @@ PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
 FILM = (640, 480)
 """Pixels of a film's panel."""
+MOST_PEOPLE = 1000
+"""Numbers of people that are looked for beside a file of somebody."""
 MOST_FPS = 1000.0
 """Frames a second that are written at most; more is a slip, and would fill the memory."""
 
@@ -248,7 +250,7 @@ def left_over(written: Sequence[Path]) -> list[Path]:
         if sum(path.stem.rpartition("_person")[0] == base for path in written) < 2:
             continue  # somebody alone, whose file the user has called so
         numbered = (person_file(last.with_stem(base), k) for k in itertools.count())
-        below = [each for each in itertools.islice(numbered, int(number)) if each.exists()]
+        below = [each for each in itertools.islice(numbered, min(int(number), MOST_PEOPLE)) if each.exists()]
         there = [*below, *itertools.takewhile(Path.exists, numbered)]
         found += [each for each in there if {each}.isdisjoint({*written, *found})]
     return found

@@ -22,6 +22,8 @@ KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 """Extensions in which keyframes themselves are compressed."""
+MOST_ZEROS = 10**6
+"""Numbers that a file may say are all zero, without holding them."""
 DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
 
@@ -62,6 +64,8 @@ class GltfFile:
             raise ValueError("sparse numbers are not read")
         kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         if "bufferView" not in accessor:
+            if not 0 <= accessor["count"] <= MOST_ZEROS:
+                raise IndexError(f"numbers {index} are {accessor['count']} that it does not hold")
             return np.zeros((accessor["count"], width))
         view = self.document["bufferViews"][accessor["bufferView"]]
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)

@@ -195,6 +195,7 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
             r"its numbers are in another file \(motion.bin\)",
         ),
         (lambda d: d.update(nodes=7), "its parts do not go together"),
+        (lambda d: d["accessors"][0].update(count=10**13) or d["accessors"][0].pop("bufferView"), "do not go together"),
         (lambda d: d["bufferViews"][1].update(byteOffset=2**63), "its parts do not go together"),
         (lambda d: d["nodes"][0].update(scale=[1e308, 1, 1]), "it is damaged|a bone is mirrored, flat or skewed"),
         (
