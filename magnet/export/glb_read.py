@@ -25,6 +25,8 @@ EVEN = 0.03
 """Share of a frame by which keys of frames may be off."""
 ALONG = 0.05
 """Largest entry by which a rotation may differ from one of axes onto axes to be taken for it."""
+SKEWED = 1e-5
+"""Largest scalar product of two axes of a rotation; what is over it is brought to the nearest rotation."""
 LONGEST = 216_000
 """Frames that a file is read as at most, two hours at 30 a second; more would fill the memory."""
 
@@ -315,7 +317,9 @@ def _bound(file: GltfFile, world: _World, joints: Sequence[int]) -> Floats:
 
 
 def _turn(matrix: Floats) -> Floats:
-    """The rotation in a transform's (..., 3, 3), without its scale.
+    """The rotation in a transform's (..., 3, 3): the nearest one, without its scale.
+
+    A parent that is scaled along one axis skews what turns below it; joints are still where the file has them.
 
     Raises:
         ValueError: it mirrors, or makes flat.
@@ -324,6 +328,10 @@ def _turn(matrix: Floats) -> Floats:
     turn = np.asarray(matrix / np.maximum(length, 1e-12), np.float64)
     if not (np.linalg.det(turn) > 0.5).all():
         raise ValueError("a bone is mirrored, flat or skewed: apply scales in your program, then export it again")
+    skewed = np.abs(np.swapaxes(turn, -1, -2) @ turn - np.eye(3)).max(axis=(-1, -2)) > SKEWED
+    if skewed.any():
+        U, _, Vh = np.linalg.svd(turn[skewed])
+        turn[skewed] = U @ Vh
     return turn
 
 

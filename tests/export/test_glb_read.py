@@ -232,3 +232,16 @@ def test_the_command_takes_them(duet: Scene, body: Body, tmp_path: Path, capsys:
     assert "a.glb person_1: the body's own skeleton" in capsys.readouterr().out
     assert cli.main(["export", str(path), str(path)]) == 2  # its only recording, perhaps
     assert "is read, and would be written over" in capsys.readouterr().err
+
+
+def test_joints_under_a_parent_that_is_scaled_along_one_axis_are_where_the_file_has_them(
+    duet: Scene, body: Body, tmp_path: Path
+) -> None:
+    scene = duet.people().select([0])
+    glb = glb_strangers.opened(stranger(scene, body, tmp_path / "a.glb"))
+    glb.document["nodes"][0]["scale"] = [1.0, 1.25, 1.0]
+    (person,) = read_glb(glb.save(tmp_path / "b.glb"))
+    turned, at = person.world()
+    found = at[:, [person.names.index(name) for name in JOINT_NAMES]]
+    assert np.abs(found - body.joints(scene)[0, :, 0].numpy() * [1.0, 1.25, 1.0]).max() < 1e-4
+    assert np.abs(turned @ turned.swapaxes(-1, -2) - np.eye(3)).max() < 1e-6
