@@ -26,6 +26,9 @@ MOST_ZEROS = 10**6
 """Numbers that a file may say are all zero, without holding them."""
 DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 
+STEEPEST = 4.0
+"""Length of a quaternion's slope over the time to the next key from which it is no turn that anybody keyed."""
+
 
 class GltfFile:
     """A .glb file that is read: its document, and what is computed from it.
@@ -160,6 +163,8 @@ def sampled(keys: Floats, values: Floats, how: str, at: Floats, turns: bool) -> 
     spline = how == "CUBICSPLINE"
     if len(values) != len(keys) * (3 if spline else 1) or not len(keys) or (np.diff(keys) <= 0).any():
         raise ValueError("a track's keys and values do not go together")
+    if spline and turns:
+        values = _one_way(keys, values)
     own = values[1::3] if spline else values
     if len(keys) == 1:
         return np.repeat(own, len(at), axis=0)
@@ -181,3 +186,20 @@ def sampled(keys: Floats, values: Floats, how: str, at: Floats, turns: bool) -> 
         return own[before] + share * (own[after] - own[before])
     unit = torch.from_numpy(own / np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-12))
     return slerp_quat(unit[before], unit[after], torch.from_numpy(share[:, 0])).numpy()
+
+
+def _one_way(keys: Floats, values: Floats) -> Floats:
+    """Keys and slopes of a spline of quaternions without changes of sign.
+
+    Blender writes a key with the other sign than the one before, which is the same pose, and slopes across such a
+    change: a bone would go round once between them. values (3 N, 4) -> same
+    """
+    way = values.reshape(-1, 3, 4).copy()
+    turned = (way[1:, 1] * way[:-1, 1]).sum(axis=-1) < 0
+    way[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None, None]
+    spans = np.diff(keys)[:, None]
+    straight = np.diff(way[:, 1], axis=0) / spans
+    for slopes in (way[:-1, 2], way[1:, 0]):  # views: after a key, and before the next
+        far = np.linalg.norm(slopes * spans, axis=-1) > STEEPEST
+        slopes[far] = straight[far]
+    return way.reshape(-1, 4)

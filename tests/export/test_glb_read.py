@@ -19,6 +19,7 @@ from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.export import formats, save_glb
 from magnet.export.bones import BoneOptions
 from magnet.export.glb_read import read_glb
+from magnet.export.gltf_file import sampled
 from magnet.export.reading import Reading, read
 from magnet.motion.scene import Scene, cat_agents
 from tests.export import glb_strangers
@@ -245,3 +246,18 @@ def test_joints_under_a_parent_that_is_scaled_along_one_axis_are_where_the_file_
     found = at[:, [person.names.index(name) for name in JOINT_NAMES]]
     assert np.abs(found - body.joints(scene)[0, :, 0].numpy() * [1.0, 1.25, 1.0]).max() < 1e-4
     assert np.abs(turned @ turned.swapaxes(-1, -2) - np.eye(3)).max() < 1e-6
+
+
+def test_a_spline_of_quaternions_does_not_go_round_where_keys_change_their_sign() -> None:
+    angle = np.array([0.0, 0.4, 0.8, 1.2]) / 2
+    own, slope = (np.stack([np.sin(angle + a), 0 * angle, 0 * angle, np.cos(angle + a)], -1) for a in (0, np.pi / 2))
+    values = np.stack([0.2 * slope, own, 0.2 * slope], axis=1)  # keys a second apart
+    at = np.linspace(0, 3, 31)
+    truth = sampled(np.arange(4.0), values.reshape(-1, 4), "CUBICSPLINE", at, turns=True)
+    signed = values * np.array([1.0, -1, -1, 1])[:, None, None]
+    found = sampled(np.arange(4.0), signed.reshape(-1, 4), "CUBICSPLINE", at, turns=True)
+    assert np.abs(np.abs((found * truth).sum(-1)) - (truth**2).sum(-1)).max() < 1e-9
+    signed[1, 2] = [0.0, 0, 0, 48]  # as Blender has it across a change of sign
+    found = sampled(np.arange(4.0), signed.reshape(-1, 4), "CUBICSPLINE", at, turns=True)
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    assert np.abs((found * truth).sum(-1) / np.linalg.norm(truth, axis=-1)).min() > 0.999
