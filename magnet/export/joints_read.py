@@ -57,7 +57,7 @@ def load_joints(
         ValueError: as `read_table`, unknown joints, no unit, no rate, nobody, or no fit.
     """
     path, table = Path(path), read_table(path)
-    rate = table.fps or fps
+    rate = table.fps or (fps and fps / table.step)
     if rate is None:
         raise ValueError(f"{path}: says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
     if up is not None and up not in UP:
@@ -76,6 +76,8 @@ def load_joints(
     fit = _fitted(path, UNITS[name] * _bridged(at @ UP[up].T, sure), used, weights, valid, rate, body)
     off = float(fit.residual[torch.from_numpy(sure & valid[..., None])].mean())
     head = f"{path.name}: joint positions, {scheme}, {len(used)} joints; unit {name}, {up} up, {rate:g} fps"
+    if table.step > 1:
+        doubts = [f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second", *doubts]
     notes = [head, f"  the body's joints lie {100 * off:.1f} cm from the file's on average", *notes, *doubts]
     if off > POOR_FIT:
         notes.append("  that is much: its proportions are far from a person's; hands and feet may miss")

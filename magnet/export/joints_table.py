@@ -19,6 +19,10 @@ COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
 """A joint's name, an axis, and perhaps a unit: left_hip_x_m, LeftHip.X, nose_y (mm)."""
 FRAME, TIME = ("frame", "frame_id", "frame_index"), ("time_s", "time", "seconds", "t", "timestamp")
 PERSON = ("person", "person_id", "id", "track", "track_id", "subject", "actor", "skeleton")
+NEAR = 0.3
+"""Share of a frame within which times of several people are of one frame."""
+SLOWEST = 1.0
+"""Seconds from a frame to the next at most."""
 LONGEST = 216_000
 """Frames that a table is read as at most."""
 
@@ -32,14 +36,16 @@ class JointTable:
     at: Floats  # (T, P, K, 3) in the table's unit and axes
     fps: float | None
     unit: str | None
+    step: int = 1  # by which the file counts its frames, such as every fifth of a camera's
 
 
 def read_table(path: str | Path) -> JointTable:
     """Read a table of joint positions: a row for each frame and person, three columns for each joint.
 
     Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`), and by `frame`, `person` and
-    `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in order, without
-    `time_s` the rate is not known. Cells may be empty.
+    `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in order, of
+    several people those of one time are one frame; without `time_s` the rate is not known. Cells may be empty, and a
+    joint at 0, 0, 0 is missing, too.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -49,7 +55,8 @@ def read_table(path: str | Path) -> JointTable:
     with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
         first = file.readline()
         file.seek(0)
-        lines = csv.reader(file, delimiter=max(",;\t", key=first.count))
+        sign = max(",;\t", key=first.count)
+        lines = csv.reader(file, delimiter=sign)
         try:
             rows = [row for row in lines if any(map(str.strip, row))]
         except csv.Error as error:
@@ -64,13 +71,14 @@ def read_table(path: str | Path) -> JointTable:
         for names in (FRAME, TIME, PERSON, ("scene",))
     )
     numbers = np.array(
-        [[_number(path, line, row, k) for k in range(len(head))] for line, row in enumerate(rows[1:], 2)]
+        [[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in enumerate(rows[1:], 2)]
     )
     if scene_at is not None and len(scenes := {row[scene_at].strip() for row in rows[1:]}) > 1:
         raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
     told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
     people = tuple(dict.fromkeys(told))
-    frame = _frames(path, numbers, frame_at, told)
+    seconds = None if time_at is None else _seconds(numbers[:, time_at])
+    frame, step = _frames(path, numbers, frame_at, told, seconds)
     at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     where = np.array(list(columns.values()))
     seen: set[tuple[int, str]] = set()
@@ -81,10 +89,11 @@ def read_table(path: str | Path) -> JointTable:
         seen.add((t, person))
         at[t, people.index(person)] = numbers[number][where]
     at[~np.isfinite(at)] = np.nan
+    at[(at == 0).all(axis=-1)] = np.nan  # as many trackers say that they did not find a joint
     if (at > FARTHEST).any() or (at < -FARTHEST).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
-    fps = None if time_at is None else _rate(numbers[:, time_at], frame)
-    return JointTable(tuple(columns), people, at, fps, unit)
+    fps = None if seconds is None else _rate(seconds, frame)
+    return JointTable(tuple(columns), people, at, fps, unit, step)
 
 
 def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str | None]:
@@ -107,30 +116,53 @@ def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str
     return whole, units.pop()
 
 
-def _number(path: Path, line: int, row: Sequence[str], k: int) -> float:
+def _number(path: Path, line: int, row: Sequence[str], k: int, sign: str) -> float:
     if k >= len(row):
         raise ValueError(f"{path}, line {line}: {len(row)} cells, fewer than names; the file may be cut short")
     try:
-        return float(row[k])
+        return float(row[k] if sign == "," else row[k].replace(",", "."))
     except ValueError:
         return math.nan  # empty, or of a column of words
 
 
-def _frames(path: Path, numbers: Floats, column: int | None, told: Sequence[str]) -> NDArray[np.int64]:
-    """The frame of each row, from 0."""
+def _frames(
+    path: Path, numbers: Floats, column: int | None, told: Sequence[str], seconds: Floats | None
+) -> tuple[NDArray[np.int64], int]:
+    """The frame of each row, from 0, and by how many the file counts on from one to the next."""
     if column is None:
+        if seconds is not None and len(set(told)) > 1 and np.isfinite(seconds).all():
+            return _by_time(seconds, told), 1
         count: dict[str, int] = {}
         frames = []
         for person in told:
             frames.append(count.setdefault(person, 0))
             count[person] += 1
-        return np.array(frames)
+        return np.array(frames), 1
     said = numbers[:, column]
     if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:
         raise ValueError(f"{path}: frame {wrong[0]:g}: expected whole numbers")
-    if said.max() - said.min() >= LONGEST:
+    frame = np.minimum(said - said.min(), 2.0**53).astype(np.int64)
+    step = max(int(np.gcd.reduce(frame)), 1) if len(set(frame.tolist())) > 2 else 1
+    if frame.max() // step >= LONGEST:
         raise ValueError(f"{path}: frames {said.min():.0f} to {said.max():.0f}, more than is read ({LONGEST})")
-    return (said - said.min()).astype(int)
+    return frame // step, step
+
+
+def _by_time(seconds: Floats, told: Sequence[str]) -> NDArray[np.int64]:
+    """The frames of several people's rows, of whom some may come later: rows of one time are of one frame."""
+    times = np.unique(seconds)
+    own = [np.diff(np.sort(seconds[[who == person for who in told]])) for person in set(told)]
+    steps = np.concatenate(own)
+    near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    new = np.concatenate([[0], np.cumsum(np.diff(times) > near)])
+    return np.asarray(new[np.searchsorted(times, seconds)], np.int64)
+
+
+def _seconds(said: Floats) -> Floats:
+    """Times in seconds: milli-, micro- and nanoseconds are told by frames that would come less than once a second."""
+    times = np.unique(said[np.isfinite(said)])
+    step = float(np.median(np.diff(times))) if len(times) > 2 else 0.0
+    return said / next((unit for unit in (1.0, 1e3, 1e6, 1e9) if step / unit <= SLOWEST), 1.0)
 
 
 def _rate(seconds: Floats, frame: NDArray[np.int64]) -> float | None:

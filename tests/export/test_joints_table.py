@@ -68,3 +68,36 @@ def test_what_cannot_be_meant_is_refused_in_one_line(lines: list[str], said: str
     with pytest.raises(ValueError, match=said) as caught:
         read_table(table(tmp_path / "a.csv", *lines))
     assert str(caught.value).startswith(str(tmp_path / "a.csv")) and "\n" not in str(caught.value)
+
+
+def test_without_frames_rows_of_one_time_are_of_one_frame(tmp_path: Path) -> None:
+    lines = ["time_s,person,a_x,a_y,a_z"]
+    for t in range(5):
+        lines += [f"{t / 25},A,{t + 1},0,0", *([f"{t / 25 + 0.002},B,{t + 1},1,0"] if t >= 2 else [])]
+    found = read_table(table(tmp_path / "a.csv", *lines))
+    assert found.at.shape == (5, 2, 1, 3) and round(found.fps or 0) == 25
+    assert np.isnan(found.at[:2, 1]).all() and found.at[2:, 1, 0, 0].tolist() == found.at[2:, 0, 0, 0].tolist()
+
+
+@pytest.mark.parametrize("start", [0, 1_700_000_000])
+@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
+def test_times_may_be_in_smaller_units_and_count_from_long_ago(unit: int, start: int, tmp_path: Path) -> None:
+    rows = [f"{unit * start + unit * t // 25 if unit > 1 else start + t / 25},{t},1,2,3" for t in range(50)]
+    assert read_table(table(tmp_path / "a.csv", "timestamp,frame,a_x,a_y,a_z", *rows)).fps == 25.0
+
+
+def test_a_joint_at_zero_is_missing(tmp_path: Path) -> None:
+    found = read_table(table(tmp_path / "a.csv", "a_x,a_y,a_z,b_x,b_y,b_z", "0,0,0,1,0,0", "0.0,1,0,0,0,0.0"))
+    assert np.isnan(found.at[[0, 1], 0, [0, 1]]).all() and found.at[0, 0, 1].tolist() == [1, 0, 0]
+
+
+def test_numbers_may_have_decimal_commas_between_semicolons(tmp_path: Path) -> None:
+    found = read_table(table(tmp_path / "a.csv", "time;a_x;a_y;a_z", "0,00;1,5;2;3", "0,04;4;5;-0,25"))
+    assert found.fps == 25.0 and found.at[:, 0, 0].tolist() == [[1.5, 2, 3], [4, 5, -0.25]]
+
+
+def test_frames_that_are_counted_in_steps_are_the_files_frames(tmp_path: Path) -> None:
+    found = read_table(
+        table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *(f"{t},{t / 50},1,2,3" for t in (10, 15, 25)))
+    )
+    assert found.step == 5 and found.at.shape[0] == 4 and found.fps == 10.0 and np.isnan(found.at[2]).all()
