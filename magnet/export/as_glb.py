@@ -1,11 +1,14 @@
 """Run by Blender's Python, which knows nothing of magnet: an FBX as GLB, with a keyframe for every frame.
 
 python as_glb.py -- IN.fbx OUT.glb
+
+An armature of several takes moves as in the first, as Blender sets it; OUT.glb.takes has a line of each other one.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Any
 
 
@@ -24,6 +27,14 @@ def main(fbx: str, glb: str) -> None:
         export_materials="NONE",
         export_morph=False,
     )
+    left = []
+    for thing in blender.data.objects:
+        if thing.type != "ARMATURE" or thing.animation_data is None or thing.animation_data.action is None:
+            continue
+        kept, own = thing.animation_data.action.name, f"{thing.name}|"
+        takes = [action.name for action in blender.data.actions if action.name.startswith(own)]
+        left += [(thing.name, kept.removeprefix(own), name.removeprefix(own)) for name in takes if name != kept]
+    Path(f"{glb}.takes").write_text("".join("\t".join(words) + "\n" for words in left), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -49,9 +49,20 @@ def _fbx_as_it_was(path: str, changed: int, size: int) -> list[RigMotion]:
     with tempfile.TemporaryDirectory() as folder:
         glb = converted(Path(path), Path(folder) / "scene.glb")
         try:
-            return read_glb(glb)
+            people = read_glb(glb)
         except ValueError as error:
             raise ValueError(str(error).replace(str(glb), path)) from error
+        return [replace(people[0], notes=(*people[0].notes, *_takes(glb))), *people[1:]]
+
+
+def _takes(glb: Path) -> list[str]:
+    """Notes on the takes of an FBX that are not read, which the script that made a GLB of it lists beside it."""
+    listed = glb.with_name(f"{glb.name}.takes")
+    left: dict[tuple[str, str], list[str]] = {}
+    for line in listed.read_text(encoding="utf-8").splitlines() if listed.exists() else []:
+        who, kept, other = line.split("\t")
+        left.setdefault((who, kept), []).append(repr(other))
+    return [f"of {who} the take {kept!r} is read, not {', '.join(others)}" for (who, kept), others in left.items()]
 
 
 RIGS: dict[str, Callable[[Path, int, int | None], list[RigMotion]]] = {".bvh": _bvh, ".glb": read_glb, ".fbx": _fbx}

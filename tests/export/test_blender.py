@@ -110,6 +110,29 @@ def test_what_blender_writes_again_is_read_back_to_the_last_frame(
         assert all("the body's own skeleton" in note for note in got.notes)
 
 
+TWO_TAKES = """
+import sys, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.scene.render.fps = 30
+bpy.ops.import_scene.gltf(filepath=sys.argv[1])
+for thing in [each for each in bpy.data.objects if each.animation_data and each.animation_data.action]:
+    thing.animation_data.action.copy().name = "second"
+    for track in list(thing.animation_data.nla_tracks):
+        thing.animation_data.nla_tracks.remove(track)
+bpy.ops.export_scene.fbx(filepath=sys.argv[2], add_leaf_bones=False)
+"""
+
+
+def test_takes_of_an_fbx_that_are_not_read_are_told(
+    blender: str, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_glb(random_scene(1, 20, 1, torch.Generator().manual_seed(11)), tmp_path / "one.glb", body)
+    words = [blender, "-c", TWO_TAKES, str(tmp_path / "one.glb"), str(tmp_path / "takes.fbx")]
+    subprocess.run(words, check=True, capture_output=True)
+    monkeypatch.setenv("MAGNET_BLENDER", blender)
+    assert any("the take " in note and "second" in note for note in read(tmp_path / "takes.fbx").notes)
+
+
 def test_a_bvh_holds_the_bodys_joints(blender, duo: Scene, body: Body, tmp_path: Path):
     truth = body.joints(duo)[0, list(FRAMES)].numpy()
     for person, path in enumerate(save_bvh(duo, tmp_path / "duo.bvh", body)):

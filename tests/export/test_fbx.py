@@ -65,3 +65,15 @@ def test_blender_opens_a_file_once_for_whoever_asks_again_and_anew_when_it_chang
     assert rig_files.read_rigs(path)[0].frames == 9 and opened == ["a.fbx"] * 2
     with pytest.raises(ValueError, match=r"a\.fbx: holds 9 frames, so end 20 is behind them"):
         rig_files.read_rigs(path, end=20)
+
+
+def test_takes_that_are_not_read_are_told(tmp_path: Path, body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    def converted(path: Path, glb: Path) -> Path:
+        glb.with_name(f"{glb.name}.takes").write_text("Anna\tWalk\tRun\nAnna\tWalk\tSit\n", encoding="utf-8")
+        return Path(shutil.copy(path, glb))
+
+    monkeypatch.setattr(rig_files, "converted", converted)
+    scene = random_scene(1, 12, 2, torch.Generator().manual_seed(4))
+    path = save_glb(scene, tmp_path / "b.glb", body).rename(tmp_path / "b.fbx")
+    notes = [person.notes for person in rig_files.read_rigs(path)]
+    assert notes == [("of Anna the take 'Walk' is read, not 'Run', 'Sit'",), ()]
