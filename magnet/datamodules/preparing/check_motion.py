@@ -99,13 +99,16 @@ def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
         )
 
 
-def up_vector(joints: Array, valid: Bools) -> Array:
-    """Head minus ankles, mean over people and valid frames; else neck minus ankles, or shoulders minus hips. -> (3,)"""
+def up_vector(joints: Array, valid: Bools) -> tuple[Array, str]:
+    """Head minus ankles, mean over people and valid frames (3,), and what it is; else of the neck or the shoulders, or
+    shoulders minus hips."""
     people = joints[valid]
-    for high, low in (((HEAD,), ANKLES), ((NECK,), ANKLES), (SHOULDERS, HIPS)):
+    tops = (("head", (HEAD,)), ("neck", (NECK,)), ("shoulders", SHOULDERS))
+    ways = [(f"{name} minus ankles", high, ANKLES) for name, high in tops]
+    for what, high, low in (*ways, ("shoulders minus hips", SHOULDERS, HIPS)):
         up = people[:, list(high)].mean(axis=1) - people[:, list(low)].mean(axis=1)
         if np.isfinite(up).all():
-            return up.mean(axis=0)
+            return up.mean(axis=0), what
     raise DataError(
         "neither head and ankles nor shoulders and hips are among the joints: no up axis can be found; give the "
         "axis with --up"
@@ -124,11 +127,11 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
     Raises:
         DataError: another axis is the dominant one, or none is.
     """
-    vector = up_vector(joints, valid)
+    vector, what = up_vector(joints, valid)
     size = np.abs(vector)
     first, second = np.argsort(-size)[:2]
     found = ("+" if vector[first] > 0 else "-") + "xyz"[first]
-    seen = "head minus ankles is on average x {:.2f}, y {:.2f}, z {:.2f} m".format(*vector)
+    seen = "{} is on average x {:.2f}, y {:.2f}, z {:.2f} m".format(what, *vector)
     clear = size[first] >= STANDING and size[second] <= BESIDE * size[first]
     if clear and found != declared:
         raise DataError(

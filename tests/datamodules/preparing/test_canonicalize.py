@@ -122,6 +122,16 @@ def test_degrees_are_named():
         canonicalize(in_degrees(recorded(people(60, 2))), BODY, "take", "made", "train")
 
 
+def test_whoever_has_neither_head_nor_neck_stands_by_the_shoulders():
+    scene = synthesize("mirror", 2, 300, torch.Generator().manual_seed(6), BODY).scene
+    joints = BODY.joints(scene)[0].numpy()
+    joints[:, :, [check_motion.HEAD, check_motion.NECK]] = np.nan
+    valid = np.ones(joints.shape[:2], dtype=bool)
+    check_motion.check_up("+y", joints, valid)
+    with pytest.raises(DataError, match=r"people stand along \+y \(shoulders minus ankles is on average"):
+        check_motion.check_up("+z", joints, valid)
+
+
 def test_nothing_that_people_do_is_refused():
     for coupling, persons in (("mirror", 2), ("handshake", 2), ("circle", 4), ("patty_cake", 2), ("follow", 1)):
         scene = synthesize(coupling, persons, 300, torch.Generator().manual_seed(6), BODY).scene
