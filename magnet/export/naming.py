@@ -38,7 +38,8 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
     "3ds Max Biped, Unreal, Rigify, Character Creator": {
         "hip": ("thigh",), "knee": ("calf", "shin"), "ankle": ("foot",), "foot": ("toe0", "toe", "ball", "toebase"),
         "collar": ("clavicle", "shoulder"), "shoulder": ("upperarm",), "elbow": ("forearm", "lowerarm"),
-        "wrist": ("hand",), "neck": ("neck", "neck01", "neck1", "necktwist01"), "head": ("head",),
+        "wrist": ("hand",), "neck": ("neck", "neck01", "neck1", "necktwist01", "spine004"),
+        "head": ("head", "spine006"),
     },
     "Motive": {
         "hip": ("thigh",), "knee": ("shin",), "ankle": ("foot",), "foot": ("toe",), "collar": ("shoulder",),

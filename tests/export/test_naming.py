@@ -118,3 +118,12 @@ def test_numbers_that_tell_joints_apart_stay() -> None:
 def test_the_middle_of_a_body_is_no_side() -> None:
     assert split_side("C_Hips") == split_side("Hips_M") == ("", {"hips"})
     assert split_side("L_Hip")[0] == "left" and split_side("chest") == ("", {"chest"})
+
+
+def test_rigifys_numbered_spine_ends_in_neck_and_head() -> None:
+    limbs = ("thigh", "shin", "foot", "toe", "shoulder", "upper_arm", "forearm", "hand")
+    spine = ["DEF-spine", *(f"DEF-spine.{k:03}" for k in range(1, 7))]
+    names = [*spine, *(f"DEF-{limb}.{side}" for side in "LR" for limb in limbs)]
+    found = recognised(names)
+    mapped = {JOINT_NAMES[j]: names[k] for j, k in found.joints.items()}
+    assert mapped["neck"] == "DEF-spine.004" and mapped["head"] == "DEF-spine.006" and len(mapped) == 18
