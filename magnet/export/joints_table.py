@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.rig_motion import FARTHEST, Floats, usual_rate
+from magnet.export.rig_motion import MOST_AWAY, Floats, usual_rate
 from magnet.files import regular
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
@@ -23,6 +23,8 @@ NEAR = 0.3
 """Share of a frame within which times of several people are of one frame."""
 SLOWEST = 1.0
 """Seconds from a frame to the next at most."""
+MOST_PEOPLE = 200
+"""People of a table at most, as in a crowd."""
 LONGEST = 216_000
 """Frames that a table is read as at most."""
 
@@ -77,6 +79,8 @@ def read_table(path: str | Path) -> JointTable:
         raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
     told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
     people = tuple(dict.fromkeys(told))
+    if len(people) > MOST_PEOPLE:
+        raise ValueError(f"{path}: its column {head[person_at or 0]} names {len(people)} people; is it a row's number?")
     seconds = None if time_at is None else _seconds(numbers[:, time_at])
     frame, step = _frames(path, numbers, frame_at, told, seconds)
     at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
@@ -90,7 +94,7 @@ def read_table(path: str | Path) -> JointTable:
         at[t, people.index(person)] = numbers[number][where]
     at[~np.isfinite(at)] = np.nan
     at[(at == 0).all(axis=-1)] = np.nan  # as many trackers say that they did not find a joint
-    if (at > FARTHEST).any() or (at < -FARTHEST).any():
+    if (at > MOST_AWAY).any() or (at < -MOST_AWAY).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
     fps = None if seconds is None else _rate(seconds, frame)
     return JointTable(tuple(columns), people, at, fps, unit, step)

@@ -155,6 +155,8 @@ def load_rigs(
         )
     prescribed = {file.up for file in files}  # where all are of formats that say it
     up = up or (prescribed.pop() if len(prescribed) == 1 else None)
+    for file in files:
+        file.require_near()
     skeletons = understood_together(files, unit, up, joints)
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]

@@ -15,7 +15,7 @@ Bools = NDArray[np.bool_]
 RATES = (23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 119.88, 120.0, 240.0)
 """Rates that a rounded Frame Time such as 0.033333 stands for."""
 
-FARTHEST = 1e7
+MOST_AWAY = 1e7
 """Largest coordinate in any unit, ten kilometres in millimetres; what is farther is no motion, but damage."""
 
 
@@ -44,6 +44,15 @@ class RigMotion:
     @property
     def frames(self) -> int:
         return len(self.local)
+
+    def require_near(self) -> None:
+        """Refuse places that no motion has, and numbers that are none.
+
+        Raises:
+            ValueError: names the file and how far a joint is away.
+        """
+        if self.place.size and not (far := float(np.abs(self.place).max())) < MOST_AWAY:
+            raise ValueError(f"{self.path}: a joint is {far:.2g} away from the one above: it is damaged")
 
     def rest(self) -> Floats:
         """Joints in the rest pose, the root at the origin. (K, 3)"""

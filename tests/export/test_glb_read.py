@@ -203,7 +203,10 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
             lambda d: d["nodes"][0].update(matrix=[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
             "a bone is mirrored, flat or skewed",
         ),
-        (lambda d: d["nodes"][0].update(translation=[1e9, 0, 0]), r"a joint is 1e\+09 away: it is damaged"),
+        (
+            lambda d: d["nodes"][0].update(translation=[1e9, 0, 0]),
+            r"a joint is 1e\+09 away from the one above",
+        ),
         (lambda d: d["accessors"][0].update(count=0), "a translation has no frames"),
         (lambda d: d["accessors"][2].update(type="VEC3"), "a rotation has 3 numbers, expected 4"),
     ],
@@ -217,7 +220,7 @@ def test_what_is_damaged_is_refused_in_one_line(change, said: str, duet: Scene, 
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(glb.binary)) + struct.pack("<I4s", len(text), b"JSON")
     (tmp_path / "a.glb").write_bytes(head + text + struct.pack("<I4s", len(glb.binary), b"BIN\0") + glb.binary)
     with pytest.raises(ValueError, match=rf"^{tmp_path}/a\.glb: .*{said}") as caught:
-        read_glb(tmp_path / "a.glb")
+        read(tmp_path / "a.glb")
     assert "\n" not in str(caught.value)
 
 

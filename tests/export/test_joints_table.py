@@ -59,6 +59,7 @@ def test_columns_that_merely_end_in_an_axis_or_could_be_a_person_are_passed_over
         (["frame,a_x,a_y,a_z", "nan,0,0,0"], "frame nan: expected whole numbers"),
         (["a_x,a_y,a_z", "0,1e9,0"], r"a joint is 1e\+09 away: numbers are damaged"),
         (["frame,a_x,a_y,a_z", "0,0,0,0", "1e9,0,0,0"], "frames 0 to 1000000000, more than is read"),
+        (["id,a_x,a_y,a_z", *(f"{k},1,2,3" for k in range(300))], "its column id names 300 people; is it a row's"),
         (["scene,a_x,a_y,a_z", "0,0,0,0", "1,0,0,0"], "holds 2 scenes; keep the rows of one"),
         (["a_x,a_y,a_z", '"' + "1" * 200_000], "line 2: field larger than field limit .* write it again as a table"),
         (["a_x_m,a_y_m,a_z_m,b_x_cm,b_y_cm,b_z_cm", "0,0,0,0,0,0"], "its columns are in different units"),
