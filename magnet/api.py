@@ -82,6 +82,7 @@ def read(
     in_fps: float | None = None,
     start: int = 0,
     end: int | None = None,
+    clip: str | None = None,
 ) -> Motion:
     """Read a scene from our file, SMPL-X npz, BVH, GLB or FBX of any skeleton, or CSV; several are several people.
 
@@ -89,15 +90,15 @@ def read(
         paths: the files, or lists of them.
         body: the scene's body model, or its file; None: the open one.
         fps: resample to this rate, by default the models'; None: as recorded.
-        trim, unit, up, joints, keep_floor, in_fps, start, end: as in `magnet.export.reading.Reading`. A unit or axis
-            that nobody can have is taken as it is said, with a warning that names what the files look like.
+        trim, unit, up, joints, keep_floor, in_fps, start, end, clip: as in `magnet.export.reading.Reading`. A unit or
+            axis that nobody can have is taken as it is said, with a warning that names what the files look like.
 
     Raises:
         FileNotFoundError: there is no such file.
         ImportError: an FBX, and no Blender.
         ValueError: a file that cannot be read, or files that do not go together; says what to do.
     """
-    options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end)
+    options = reading.Reading(fps, trim, unit, up, joints or {}, keep_floor, in_fps, start, end, clip)
     one = (str, Path)
     lists = [[each] if isinstance(each, one) or not isinstance(each, Iterable) else each for each in paths]
     files = [file for each in lists for file in each]

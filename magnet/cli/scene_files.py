@@ -21,7 +21,7 @@ Options = argparse.ArgumentParser | argparse._ArgumentGroup
 
 OF_FILES = (
     *("--frames", "--context", "--spacing", "--style", "--size", "--start", "--end", "--trim"),
-    *("--body", "--in_fps", "--in_unit", "--up", "--keep_floor", "--joint"),
+    *("--body", "--in_fps", "--in_unit", "--up", "--keep_floor", "--joint", "--clip"),
 )
 """Options of `magnet predict` that go with files, or with people from nothing, and not with a data set."""
 
@@ -76,6 +76,7 @@ def add_origin(options: Options) -> None:
     )
     options.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point)")
     options.add_argument("--keep_floor", action="store_true", help="keep people at the height they were recorded at")
+    options.add_argument("--clip", metavar="NAME", help="animation of a .glb that is read (default: the first)")
     theirs = "left_hip=Thigh_L, where names say nothing"
     options.add_argument("--joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
 
@@ -94,6 +95,7 @@ def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
         in_fps=options.in_fps,
         start=options.start,
         end=options.end,
+        clip=options.clip,
     )
 
 

@@ -44,7 +44,7 @@ Tracks = dict[tuple[int, str], Track]
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged numbers are refused, without numpy's warnings
-def read_glb(path: str | Path, start: int = 0, end: int | None = None) -> list[RigMotion]:
+def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str | None = None) -> list[RigMotion]:
     """Read all people of one GLB file.
 
     A person is a skin's skeleton, and the skins of clothes and hair on it; in a file without skins, every tree of nodes
@@ -54,16 +54,17 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None) -> list[R
     Args:
         path: the file.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
+        clip: the animation that is read, by its name; None: see above.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no GLB, damaged, no skeletons, no such frames.
+        ValueError: no GLB, damaged, no skeletons, no such frames or animation.
     """
     path = Path(path)
     file = GltfFile(path)
     with _in_one_line(path):
         people = _people(file)
-        tracks, notes = _tracks(file)
+        tracks, notes = _tracks(file, clip)
         at, fps, also = _clock([track for (node, _), track in tracks.items() if _moves(file, node, people)])
         kept = kept_frames(path, len(at), start, end)
         world = _World(file, tracks, at[kept])
@@ -175,17 +176,20 @@ def _animations(file: GltfFile) -> list[dict[str, Any]]:
     return list(file.document.get("animations", []))
 
 
-def _tracks(file: GltfFile) -> tuple[Tracks, list[str]]:
+def _tracks(file: GltfFile, clip: str | None) -> tuple[Tracks, list[str]]:
     """What moves nodes, and notes on animations that are left out."""
     tracks: Tracks = {}
     taken: dict[int, str] = {}
     left: list[str] = []
-    for number, animation in enumerate(_animations(file)):
-        name = str(animation.get("name") or f"animation {number}")
+    named = [(str(each.get("name") or f"animation {k}"), each) for k, each in enumerate(_animations(file))]
+    chosen = [(name, each) for name, each in named if clip in (None, name)]
+    if clip is not None and not chosen:
+        raise ValueError(f"has no animation {clip!r}; it has {', '.join(name for name, _ in named) or 'none'}")
+    for name, animation in chosen:
         channels = [each for each in animation["channels"] if each["target"].get("path") in DEFAULTS]
         nodes = {channel["target"]["node"] for channel in channels if "node" in channel["target"]}
         if both := nodes & set(taken):
-            left.append(f"animation {name!r} is not read: it moves what {taken[min(both)]!r} moves")
+            left.append(f"animation {name!r} is not read: it moves what {taken[min(both)]!r} moves; --clip chooses")
             continue
         taken |= dict.fromkeys(nodes, name)
         for channel in channels:

@@ -50,6 +50,7 @@ class Reading:
         keep_floor: keep people of other programs' files at the height they were recorded at.
         in_fps: frames a second of npz and csv files that do not say it.
         start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
+        clip: the animation of GLB files that is read, by its name; None: the first that moves somebody.
     """
 
     fps: float | None = None
@@ -61,12 +62,13 @@ class Reading:
     in_fps: float | None = None
     start: int = 0
     end: int | None = None
+    clip: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("fps", "in_fps"):
             if getattr(self, name) is not None:
                 require_number(name, getattr(self, name), over=0, most=MOST_FPS)
-        for name in ("unit", "up"):
+        for name in ("unit", "up", "clip"):
             if not isinstance(getattr(self, name), str | None):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a word, or None")
         for name in ("trim", "keep_floor"):
@@ -117,6 +119,8 @@ def read(
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
             notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
         return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
+    if options.clip is not None:
+        raise ValueError(f"{files[0]}: clip: chooses an animation of a .glb")
     if suffixes == {TABLE}:
         return _from_tables(files, body, options)
     if options.joints:
@@ -162,7 +166,7 @@ def shared(options: Reading, *groups: Sequence[str | Path]) -> list[Reading]:
 def _suits(file: Path) -> set[str]:
     """The options that only some kinds of file take, and this one does."""
     if file.suffix.lower() in RIGS:
-        return {"unit", "up", "joints"}
+        return {"unit", "up", "joints", *(["clip"] if file.suffix.lower() == ".glb" else [])}
     if file.suffix.lower() == TABLE:
         return {"unit", "up", "joints", "in_fps"}
     return set() if is_ours(file) else {"unit", "up", "in_fps"}

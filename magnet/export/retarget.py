@@ -115,6 +115,7 @@ def load_rigs(
     keep_floor: bool = False,
     start: int = 0,
     end: int | None = None,
+    clip: str | None = None,
 ) -> Imported:
     """Read BVH, GLB or FBX files, of one person or several: our own, or any skeleton with known joint names.
 
@@ -131,6 +132,7 @@ def load_rigs(
         joints: our joint's name to theirs, for names that no scheme knows.
         keep_floor: keep fitted people at the height they were recorded at.
         start, end: the frames of each file that are read, at its own rate, from 0 and without `end`; None: to the last.
+        clip: the animation of GLB files that is read, by its name; None: the first.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -145,7 +147,7 @@ def load_rigs(
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    files = [rig for path in each for rig in people_of(read_rigs(path, start, end), joints)]
+    files = [rig for path in each for rig in people_of(read_rigs(path, start, end, clip), joints)]
     require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
     if len(rates) > 1 and fps is None:

@@ -16,12 +16,13 @@ from magnet.export.rig_motion import RigMotion
 from magnet.files import regular
 
 
-def read_rigs(path: str | Path, start: int = 0, end: int | None = None) -> list[RigMotion]:
+def read_rigs(path: str | Path, start: int = 0, end: int | None = None, clip: str | None = None) -> list[RigMotion]:
     """Everybody in one file of `RIGS`.
 
     Args:
         path: the file.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
+        clip: the animation of a GLB that is read, by its name; None: the first that moves somebody.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -29,7 +30,11 @@ def read_rigs(path: str | Path, start: int = 0, end: int | None = None) -> list[
         ValueError: what cannot be read; says what to do.
     """
     path = Path(path)
-    return RIGS[path.suffix.lower()](path, start, end)
+    if clip is None:
+        return RIGS[path.suffix.lower()](path, start, end)
+    if path.suffix.lower() != ".glb":
+        raise ValueError(f"{path}: clip: chooses an animation of a .glb; a .bvh has one, of an .fbx write a .glb")
+    return read_glb(path, start, end, clip)
 
 
 def _bvh(path: Path, start: int, end: int | None) -> list[RigMotion]:

@@ -140,6 +140,25 @@ def test_animals_and_things_are_left_out_and_told_of(duet: Scene, body: Body, tm
         read(glb.save(path))
 
 
+def test_an_animation_is_chosen_by_its_name(duet: Scene, body: Body, tmp_path: Path) -> None:
+    glb = glb_strangers.opened(stranger(duet, body, tmp_path / "a.glb"))
+    for clip in list(glb.document["animations"]):
+        still = [channel for channel in clip["channels"] if channel["target"]["path"] != "rotation"]
+        glb.document["animations"].append(clip | {"name": "stand", "channels": still})
+    path = glb.save(tmp_path / "b.glb")
+    assert off(read(path).scene, duet, body) < 1e-4, "the first"
+    stands = read(path, options=Reading(clip="stand", keep_floor=True))
+    turned = stands.scene.body_rot[0, 1:] - stands.scene.body_rot[0, :1]
+    assert float(turned.abs().max()) < 0.05 and "not read" not in "".join(stands.notes)
+    with pytest.raises(ValueError, match="has no animation 'run'; it has Armature0 moves, Armature1 moves, stand"):
+        read(path, options=Reading(clip="run"))
+    for other in ("a.npz", "a.csv", "a.bvh"):
+        (tmp_path / other).touch()
+        with pytest.raises(ValueError, match=r"clip: chooses an animation of a \.glb"):
+            read(tmp_path / other, options=Reading(clip="run"))
+    assert cli.main(["export", str(path), str(tmp_path / "c.npz"), "--clip", "stand"]) == 0
+
+
 def test_controls_beside_the_hips_hang_on_the_armature_which_is_the_root(
     duet: Scene, body: Body, tmp_path: Path
 ) -> None:
