@@ -117,7 +117,7 @@ def _try_folder(path: Path) -> None:
 
 
 @contextmanager
-def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Path]:
+def whole(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, of the same suffix, that takes its place when the block ends well; its folder is made.
 
     So what was there before stays where the disk is full or somebody interrupts, and no half file is left. What is no
@@ -126,13 +126,12 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
 
     Args:
         path: the file that the block writes; of a link, the file that it leads to.
-        advice: what to do if the disk is full.
 
     Raises:
         CannotWrite: the disk is full, or the folder does not take files.
     """
     path = Path(path)
-    with writing(path, advice):
+    with writing(path, "choose another place"):
         path.parent.mkdir(parents=True, exist_ok=True)
         target = Path(os.path.realpath(path))
         # Of the path and not of the target, which a pipe behind /dev/stdout does not have.
@@ -143,7 +142,8 @@ def whole(path: str | Path, advice: str = "choose another place") -> Iterator[Pa
         try:
             yield part
             if target.exists():
-                shutil.copymode(target, part)
+                with suppress(OSError):  # some network file systems have no modes, and the file is finished
+                    shutil.copymode(target, part)
             part.replace(target)
         except OSError as error:
             if str(error.filename) != str(part):

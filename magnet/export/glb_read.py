@@ -14,7 +14,7 @@ import numpy as np
 from magnet.export.cutting import kept_frames
 from magnet.export.gltf_file import DEFAULTS, GltfFile, matrices, sampled
 from magnet.export.rig import people_of
-from magnet.export.rig_motion import Floats, RigMotion, rest_of, usual_rate
+from magnet.export.rig_motion import LONGEST, Floats, RigMotion, rest_of, usual_rate
 from magnet.motion.scene import FPS
 
 FEWEST_BONES = 12
@@ -27,8 +27,6 @@ ALONG = 0.05
 """Largest entry by which a rotation may differ from one of axes onto axes to be taken for it."""
 SKEWED = 1e-5
 """Largest scalar product of two axes of a rotation; what is over it is brought to the nearest rotation."""
-LONGEST = 216_000
-"""Frames that a file is read as at most, two hours at 30 a second; more would fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +94,6 @@ class GlbRig:
     joints: tuple[int, ...]
     turn: Floats
 
-    def at_rest(self, node: int) -> Floats:
-        """Where a node is when nothing moves. -> (4, 4)"""
-        return _World(self.file, {}, np.zeros(1)).at_rest(node)
-
 
 def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig:
     """The one character of a GLB file, which need not move.
@@ -115,11 +109,12 @@ def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig
     with _in_one_line(file.path), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         groups, still = _people(file, needs_motion=False), _World(file, {}, np.zeros(1))
         rigs = [_person(file, still, joints, FPS, (), len(groups) > 1) for joints in groups]
-        people = [rig.person for rig in people_of(rigs, given)]
+        people = people_of(rigs, given)
         if len(people) > 1:
-            raise ValueError(f"holds {', '.join(people)}: expected one character; export each to a file of its own")
-        k = [rig.person for rig in rigs].index(people[0])
-        return GlbRig(file, rigs[k], tuple(groups[k]), _turn(_bound(file, still, groups[k])[:, :3, :3]))
+            said = ", ".join(rig.person for rig in people)
+            raise ValueError(f"holds {said}: expected one character; export each to a file of its own")
+        k = next(k for k, rig in enumerate(rigs) if rig.names == people[0].names)
+        return GlbRig(file, rigs[k], tuple(groups[k]), _turn(_bound(file, groups[k])[:, :3, :3]))
 
 
 # -- who is there ------------------------------------------------------------------------------
@@ -229,19 +224,11 @@ def _clock(tracks: Sequence[Track]) -> tuple[Floats, float, list[str]]:
 
 
 class _World:
-    """Where nodes are in the world, frame by frame and at rest. at (T,) seconds"""
+    """Where nodes are in the world, frame by frame. at (T,) seconds"""
 
     def __init__(self, file: GltfFile, tracks: Tracks, at: Floats) -> None:
         self.file, self.tracks, self.at = file, tracks, at
         self.moved: dict[int, Floats] = {}
-
-    def at_rest(self, node: int) -> Floats:
-        """(4, 4)"""
-        whole = np.eye(4)
-        for each in (node, *self.file.above(node)):
-            said = self.file.resting(each)
-            whole = matrices(*(said[what][None] for what in ("translation", "rotation", "scale")))[0] @ whole
-        return whole
 
     def __call__(self, node: int) -> Floats:
         """(T, 4, 4), or (1, 4, 4) where nothing moves it"""
@@ -271,7 +258,7 @@ def _person(
     nearest = [next((number[up] for up in file.above(node) if up in number), -1) for node in joints]
     T = len(world.at)
     moved = np.stack([np.broadcast_to(world(node), (T, 4, 4)) for node in joints], axis=1)  # (T, K, 4, 4)
-    bound = _bound(file, world, joints)
+    bound = _bound(file, joints)
     turned = _turn(moved[..., :3, :3]) @ np.swapaxes(_turn(bound[:, :3, :3]), -1, -2)
     at, rest = moved[..., :3, 3], bound[:, :3, 3]
     local, place, offsets = turned.copy(), at.copy(), rest.copy()
@@ -299,7 +286,7 @@ def _named(file: GltfFile, joints: Sequence[int]) -> str:
     return name
 
 
-def _bound(file: GltfFile, world: _World, joints: Sequence[int]) -> Floats:
+def _bound(file: GltfFile, joints: Sequence[int]) -> Floats:
     """Joints as they were bound to their skins, as nodes rest where no skin says it. -> (K, 4, 4)"""
     bound: dict[int, Floats] = {}
     skins = [skin for skin in file.document.get("skins", []) if "inverseBindMatrices" in skin]
@@ -309,8 +296,8 @@ def _bound(file: GltfFile, world: _World, joints: Sequence[int]) -> Floats:
             if node in joints and node not in bound:
                 bound[node] = np.linalg.inv(back).astype(np.float64)
     like = next((node for node in joints if node in bound), None)
-    to_skin = np.eye(4) if like is None else bound[like] @ np.linalg.inv(world.at_rest(like))
-    whole = np.stack([bound[node] if node in bound else to_skin @ world.at_rest(node) for node in joints])
+    to_skin = np.eye(4) if like is None else bound[like] @ np.linalg.inv(file.at_rest(like))
+    whole = np.stack([bound[node] if node in bound else to_skin @ file.at_rest(node) for node in joints])
     # Skins may have other axes than the world, such as z up; whoever lies is told from who stands by the rest pose.
     back = _turn(to_skin[:3, :3]).T
     if np.abs(back - back.round()).max() < ALONG:

@@ -139,6 +139,14 @@ class GltfFile:
             return {"translation": matrix[:3, 3], "rotation": quat, "scale": scale}
         return {what: np.array(said.get(what, usual), dtype=np.float64) for what, usual in DEFAULTS.items()}
 
+    def at_rest(self, node: int) -> Floats:
+        """Where a node is in the world when nothing moves. -> (4, 4)"""
+        whole = np.eye(4)
+        for each in (node, *self.above(node)):
+            said = self.resting(each)
+            whole = matrices(*(said[what][None] for what in DEFAULTS))[0] @ whole
+        return whole
+
 
 def matrices(translation: Floats, rotation: Floats, scale: Floats) -> Floats:
     """Transforms of nodes. (T or 1, 3), (T or 1, 4), (T or 1, 3) -> (T or 1, 4, 4)"""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.export.rig_motion import MOST_AWAY, Floats, usual_rate
+from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
 from magnet.files import regular
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
@@ -25,8 +25,6 @@ SLOWEST = 1.0
 """Seconds from a frame to the next at most."""
 MOST_PEOPLE = 200
 """People of a table at most, as in a crowd."""
-LONGEST = 216_000
-"""Frames that a table is read as at most."""
 
 
 @dataclass(frozen=True)

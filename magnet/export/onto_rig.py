@@ -240,7 +240,7 @@ def _animated(character: GlbRig, moved: Moved, frames: int, fps: float) -> bytes
             quaternions = unbroken(to_quat(torch.from_numpy(np.broadcast_to(local, (frames, 3, 3)).copy())))
             track(node, "rotation", quaternions.numpy(), "VEC4")
     pelvis = joints[moved.pelvis]
-    above = character.at_rest(file.parents[pelvis]) if pelvis in file.parents else np.eye(4)
+    above = file.at_rest(file.parents[pelvis]) if pelvis in file.parents else np.eye(4)
     back = np.linalg.inv(above)
     track(pelvis, "translation", moved.at @ back[:3, :3].T + back[:3, 3], "VEC3")
     document["animations"] = [clip]

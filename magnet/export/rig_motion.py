@@ -15,6 +15,8 @@ Bools = NDArray[np.bool_]
 RATES = (23.976, 24.0, 25.0, 29.97, 30.0, 48.0, 50.0, 59.94, 60.0, 90.0, 100.0, 119.88, 120.0, 240.0)
 """Rates that a rounded Frame Time such as 0.033333 stands for."""
 
+LONGEST = 216_000
+"""Frames that a file is read as at most, two hours at 30 a second; more would fill the memory."""
 MOST_AWAY = 1e7
 """Largest coordinate in any unit, ten kilometres in millimetres; what is farther is no motion, but damage."""
 
