@@ -69,7 +69,7 @@ def save_onto(
     """Write one scene (B = 1) as characters of your own: a file a person, out_person0.glb ..., or the path for one.
 
     Hips are where people's are, higher or lower as legs are longer or shorter; bones turn as people's, those that we
-    have not (fingers, twists, faces, collars) stay as they rest on the one above.
+    have not (fingers, twists, faces) stay as they rest on the one above.
 
     Args:
         rigs: files of one character each, of the path's suffix, .bvh, .glb or .fbx: one for everybody, or one for each
