@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
@@ -83,6 +84,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.context < 0:
         raise CommandError(f"--context {options.context}: expected 0 frames or more")
     refuse_unused(options, out.suffix.lower())
+    if missing := [rig for rig in options.rig if not Path(rig).is_file()]:
+        raise CommandError(f"--rig {missing[0]}: no such file")
     film = out.suffix.lower() in formats.PICTURES  # leaves out frames itself, without making new ones
     reading = scene_files.reading(options, None if film and len(options.inputs) == 1 else options.fps)
     got = scene_files.read_inputs(options, reading)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import difflib
 import itertools
 import time
 from collections.abc import Sequence
@@ -71,7 +72,7 @@ def meant(arguments: Sequence[str]) -> bool:
     """Whether a command line after `predict` is about files, or about people from nothing, and not about a data set."""
     first = arguments[0] if arguments else ""
     about_help = list(arguments[:2]) == ["--help", "files"] or first == "--help=files"
-    people = any(argument.partition("=")[0] == "--people" for argument in arguments)
+    people = any(difflib.get_close_matches(argument.partition("=")[0], ["--people"], 1, 0.8) for argument in arguments)
     file = not first.startswith("-") and (Path(first).suffix != "" or (first != "" and Path(first).is_dir()))
     return about_help or people or file or _names_files(arguments)
 

@@ -93,6 +93,9 @@ def save_onto(
         raise ValueError(
             f"a character is written as it was read: got {names} for {path.name}; use {', '.join(WRITERS)}"
         )
+    for file in files:
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: no such file")
     if len(files) not in (1, len(slots)):
         raise ValueError(f"got {len(files)} characters for {len(slots)} people: give one for all, or one for each")
     places = paths_of(path, slots)

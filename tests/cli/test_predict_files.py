@@ -319,6 +319,7 @@ def test_files_may_stand_behind_options() -> None:
     from magnet.cli.predict_files import READ, meant
 
     assert READ == reading.READ
+    assert meant(["--poeple", "2", "--out", "c.glb"]), "misspelt, which the parser of files says"
     assert meant(["--task", "joint_future", "a.bvh", "b.bvh", "--out", "c.glb"])
     assert meant(["--seed=3", "A.NPZ"]) and meant(["--trim", "a.bvh", "--out", "c.glb"])
     for words in (["--out", "a.npz", "b.npz"], ["--data.path", "a.npz"], ["--view", "--data.path", "a.npz"]):

@@ -177,7 +177,7 @@ def test_the_command_writes_a_file_a_person_and_says_what_cannot_be(
         (["dance.glb", "--rig", "hero.glb", "--names", "vrm"], "--names: a character has its own"),
         (["dance.glb", "--rig_joint", "a=b"], "--rig_joint: names joints of a character, which --rig names"),
         (["hero.glb", "--person", "0", "--rig", "hero.glb"], "hero.glb: is read, and would be written over"),
-        (["dance.glb", "--rig", "none.glb"], "none.glb"),
+        (["dance.glb", "--rig", "none.glb"], "--rig none.glb: no such file"),
     ):
         assert cli.main(["export", "duet.npz", *words]) == 2
         error = capsys.readouterr().err
