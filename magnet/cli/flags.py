@@ -89,6 +89,7 @@ class PlainParser(argparse.ArgumentParser):
         name = unknown[1].partition("=")[0] if unknown else ""
         hint = closest(name, list(self._option_string_actions)) if unknown else ""
         hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
+        message = f"no option {name}" if unknown else message  # as the commands with a Trainer say it
         several = [
             action.option_strings[0] for action in self._actions if action.option_strings and action.nargs == "+"
         ]
