@@ -17,6 +17,7 @@ EPILOG = """\
 OUT's suffix:
   .npz    the scene itself; with --smplx, SMPL-X's conventional keys
   .bvh    a skeleton a person: out_person0.bvh, out_person1.bvh ..., all in one world
+  .vrma   the same for VRM avatars: VRM animations
   .glb    everybody skinned, coloured and animated in one world
   .fbx    the same, by Blender, where it or its module bpy is
   .usdc .usda .usdz   the same as USD (pip install "magnet-motion[usd]")
@@ -58,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     clips = "one animation of a .glb for all, or one for each person"
     add("--clips", choices=("scene", "person"), default="scene", help=clips)
     own = options.add_argument_group("onto characters of your own, a file a person")
-    rigs = "a character that is moved, of OUT's suffix: .glb, .fbx or .bvh; one for all, or one for each person"
+    rigs = "a character that is moved: .glb, .gltf, .vrm to .glb, .fbx to .fbx, .bvh to .bvh; one for all, or one each"
     own.add_argument("--rig", nargs="+", default=[], metavar="FILE", help=rigs)
     theirs = "left_hip=Thigh_L, where the character's names say nothing"
     own.add_argument("--rig_joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)

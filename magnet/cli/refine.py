@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from magnet.motion.scene import Scene
 
 EPILOG = """\
-IN is a scene (.npz of magnet or of SMPL-X) or a .bvh, .glb, .fbx or .csv file; several are several people of one
-world. OUT's suffix says what is written, as for `magnet export`. Roots, legs and arms are corrected, smoothly and as
-little as they can be, so that nobody is in anybody's body or in their own, hands that were together stay together, low
-toes stand still, whoever is in the air without falling comes down, soles are not under the floor, and nobody jumps up
-or down within a frame. These are goals, weighed against each other: the table says how it was and how it is, and limbs
-that stay over 5 cm in each other are named below it.
+IN is a scene (.npz of magnet or of SMPL-X) or a .bvh, .glb, .gltf, .vrma, .fbx or .csv file; several are several
+people of one world. OUT's suffix says what is written, as for `magnet export`. Roots, legs and arms are corrected,
+smoothly and as little as they can be, so that nobody is in anybody's body or in their own, hands that were together
+stay together, low toes stand still, whoever is in the air without falling comes down, soles are not under the floor,
+and nobody jumps up or down within a frame. These are goals, weighed against each other: the table says how it was and
+how it is, and limbs that stay over 5 cm in each other are named below it.
 
 for example:
   magnet refine demo/quartet.npz apart.npz

@@ -30,7 +30,10 @@ def parser_of(command: str, description: str | None, epilog: str, inputs: str = 
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
     options.add_argument(
-        "inputs", nargs=inputs, metavar="IN", help="a .npz, .bvh, .glb, .fbx or .csv; several are several people"
+        "inputs",
+        nargs=inputs,
+        metavar="IN",
+        help="a .npz, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people",
     )
     return options
 

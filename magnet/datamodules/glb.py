@@ -1,4 +1,4 @@
-"""A user's own GLB and FBX files of any skeletons: everybody of a scene in one file, or one person a file."""
+"""A user's own glTF, VRM and FBX files of any skeletons: everybody of a scene in one file, or one person a file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from magnet.export.rig_files import read_rigs
 
 @register_reader
 class GLBReader(RigReader):
-    """A folder of GLB and FBX files, of one person or several each; names, a pattern or a table say which go together.
+    """A folder of glTF (.glb, .gltf), VRM animations (.vrma) and FBX files, of one person or several each.
 
-    Units and which joint is which are found in each file, as `magnet export` finds them; y is up, as both formats say.
-    FBX is read through Blender.
+    Names, a pattern or a table say which go together. Units and which joint is which are found in each file, as `magnet
+    export` finds them; y is up, as all formats say. FBX is read through Blender.
 
     Args:
         root: the folder.
@@ -31,11 +31,11 @@ class GLBReader(RigReader):
     """
 
     name: ClassVar[str] = "glb"
-    title: ClassVar[str] = "GLB and FBX files"
+    title: ClassVar[str] = "GLB, glTF, VRM animation and FBX files"
     fake: ClassVar[str] = "magnet.datamodules.fakes.glb"
-    suffixes: ClassVar[tuple[str, ...]] = (".glb", ".fbx")
+    suffixes: ClassVar[tuple[str, ...]] = (".glb", ".gltf", ".vrma", ".fbx")
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("NAME.glb", "everybody of a scene, of any skeletons; or a person each and .fbx (docs/own.md)"),
+        ("NAME.glb", "everybody of a scene, of any skeletons; or a person each, and .gltf, .vrma, .fbx (docs/own.md)"),
     )
     one_person_a_file: ClassVar[bool] = False
 

@@ -21,6 +21,7 @@ from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
 from magnet.export.onto_rig import RigOptions, save_onto
 from magnet.export.usd import require_usd, save_usd
+from magnet.export.vrma import save_vrma
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, require_rotations
 
@@ -117,6 +118,7 @@ WRITTEN: dict[str, Format] = {
     # A skeleton a person, one file each.
     ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit, names=o.bones.names)),
     ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
+    ".vrma": Format(lambda one, to, o: save_vrma(one, to, o.body)),  # for VRM avatars, a file a person
     ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)], ready=blender),  # the same, by Blender
     **{suffix: Format(_write_usd, ready=require_usd) for suffix in USD},
     ".csv": Format(lambda all, to, o: [save_csv(all, to, o.body)], batch=True),  # a table of joint positions
@@ -126,6 +128,9 @@ WRITTEN: dict[str, Format] = {
     ".png": Format(_write_strip, batch=True, own_rate=True),  # a strip of moments
 }
 """Suffixes that can be written, and how."""
+
+APART = (".bvh", ".vrma")
+"""Of these, which hold one person."""
 
 
 def require_writer(path: Path, size: Size | None = None) -> None:
@@ -220,7 +225,7 @@ def _write_onto(
 
 
 def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:
-    """Where `write` puts so many scenes: in one file, or in a file each; several people of a .bvh have files of theirs.
+    """Where `write` puts so many scenes: in one file, or in a file each; people of `APART` have files of theirs.
 
     path, smplx: as for `write`.
     """
@@ -237,7 +242,7 @@ def files_of(
     places = places_of(path, len(slots), smplx)
     if smplx and each:
         return [file for place, there in zip(places, slots, strict=True) for file in each_of(place, there)]
-    if path.suffix.lower() != ".bvh" and not rigs:
+    if path.suffix.lower() not in APART and not rigs:
         return places
     return [file for place, there in zip(places, slots, strict=True) for file in paths_of(place, there)]
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import PARENTS
-from magnet.export.bones import BoneOptions, bone_names
+from magnet.export.bones import BoneOptions, Names, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.files import whole
 from magnet.motion.frames import canonical_frame, inverse
@@ -200,15 +200,10 @@ class Gltf:
         label = f"person_{slot}"
         group = self.add("nodes", {"name": label, "children": []})
         floor = self.add("nodes", {"name": "root", "children": []}) if bones.root == "floor" else None
-        pelvis = len(self.document["nodes"])
+        pelvis = self.bones(rest, bones.names)
         if floor is not None:
             self.document["nodes"][group]["children"].append(floor)
         self.document["nodes"][group if floor is None else floor]["children"].append(pelvis)
-        for j, name in enumerate(bone_names(bones.names)):
-            away = rest[j] - (rest[PARENTS[j]] if j else 0.0)
-            node: dict[str, Any] = {"name": name, "translation": away.tolist()}
-            children = [pelvis + c for c in range(BODY_JOINTS) if PARENTS[c] == j]
-            self.add("nodes", node | ({"children": children} if children else {}))
         joints = [*range(pelvis, pelvis + BODY_JOINTS), *([] if floor is None else [floor])]
         bind = np.tile(np.eye(4), (len(joints), 1, 1))
         bind[:BODY_JOINTS, 3, :3] = -rest.numpy()  # column-major: the translation is the last row
@@ -233,6 +228,16 @@ class Gltf:
         # A skinned mesh moves with its joints alone, so that it must not also hang on a node that moves.
         self.document["scenes"][0]["nodes"] += [group, self.add("nodes", body)]
         return pelvis, floor
+
+    def bones(self, rest: Tensor, names: Names) -> int:
+        """Nodes of the joints of one person at rest, in order; returns the pelvis's. rest (22, 3), standing"""
+        pelvis = len(self.document["nodes"])
+        for j, name in enumerate(bone_names(names)):
+            away = rest[j] - (rest[PARENTS[j]] if j else 0.0)
+            node: dict[str, Any] = {"name": name, "translation": away.tolist()}
+            children = [pelvis + c for c in range(BODY_JOINTS) if PARENTS[c] == j]
+            self.add("nodes", node | ({"children": children} if children else {}))
+        return pelvis
 
     def animate(self, clip: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
         """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""

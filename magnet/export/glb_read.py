@@ -1,4 +1,4 @@
-"""Reader of GLB files: every skinned skeleton is a person, sampled at one rate, from a rest pose as BVH has them."""
+"""Reader of glTF files: every skinned skeleton is a person, sampled at one rate, from a rest pose as BVH has them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Tracks = dict[tuple[int, str], Track]
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged numbers are refused, without numpy's warnings
 def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str | None = None) -> list[RigMotion]:
-    """Read all people of one GLB file.
+    """Read all people of one file of `GLTF`.
 
     A person is a skin's skeleton, and the skins of clothes and hair on it; in a file without skins, every tree of nodes
     that moves. They rest as they were bound to their skins. Keyframes are read at their own rate, and those that are
@@ -56,11 +56,11 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no GLB, damaged, no skeletons, no such frames or animation.
+        ValueError: no glTF, damaged, no skeletons, no such frames or animation.
     """
     path = Path(path)
     file = GltfFile(path)
-    with _in_one_line(path):
+    with in_one_line(path):
         people = _people(file)
         tracks, notes = _tracks(file, clip)
         at, fps, also = _clock([track for (node, _), track in tracks.items() if _moves(file, node, people)])
@@ -70,7 +70,7 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str
 
 
 @contextmanager
-def _in_one_line(path: Path) -> Iterator[None]:
+def in_one_line(path: Path) -> Iterator[None]:
     """Errors of damaged files, with the file's name."""
     try:
         yield
@@ -96,7 +96,7 @@ class GlbRig:
 
 
 def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig:
-    """The one character of a GLB file, which need not move.
+    """The one character of a glTF file, which need not move.
 
     Args:
         given: our joint's name to its own, for names that no scheme knows.
@@ -106,7 +106,7 @@ def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig
         ValueError: as `read_glb`, or several people.
     """
     file = GltfFile(Path(path))
-    with _in_one_line(file.path), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    with in_one_line(file.path), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         groups, still = _people(file, needs_motion=False), _World(file, {}, np.zeros(1))
         rigs = [_person(file, still, joints, FPS, (), len(groups) > 1) for joints in groups]
         people = people_of(rigs, given)

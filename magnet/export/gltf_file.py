@@ -1,14 +1,17 @@
-"""The parts of a binary glTF 2.0 file that say how nodes move: numbers, the tree of nodes, their places in time."""
+"""The parts of a glTF 2.0 file that say how nodes move: numbers, the tree of nodes, their places in time."""
 
 from __future__ import annotations
 
 import base64
 import binascii
+import copy
 import json
+import mimetypes
 import struct
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -18,6 +21,8 @@ from magnet.files import regular
 from magnet.motion.resample import slerp_quat
 from magnet.motion.rotations import from_quat, to_quat
 
+GLTF = (".glb", ".gltf", ".vrm", ".vrma")
+"""Suffixes of glTF: one file; a text with files beside it; VRM's avatars and motions, which say what each bone is."""
 KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -31,32 +36,22 @@ STEEPEST = 4.0
 
 
 class GltfFile:
-    """A .glb file that is read: its document, and what is computed from it.
+    """A glTF file that is read, binary or a text: its document, and what is computed from it.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no GLB, cut short, or of an extension that is not read.
+        ValueError: no glTF, cut short, or of an extension that is not read.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         data = regular(path).read_bytes()
+        self._buffers: dict[int, bytes] = {}
         try:
-            magic, version, length = struct.unpack_from("<4sII", data)
-            size, kind = struct.unpack_from("<I4s", data, 12)
-            if magic != b"glTF" or version != 2 or kind != b"JSON":
-                raise ValueError("it does not begin as glTF 2.0 does")
-            if length > len(data):
-                raise ValueError(f"it says that it has {length} bytes, and has {len(data)}")
-            self.document: dict[str, Any] = json.loads(data[20 : 20 + size])
+            self.document, self.binary = _opened(data)
             self.nodes: list[dict[str, Any]] = self.document.get("nodes", [])
-            begin = 20 + size
-            self.binary = b""
-            if len(data) > begin:
-                count, kind = struct.unpack_from("<I4s", data, begin)
-                self.binary = data[begin + 8 : begin + 8 + count] if kind == b"BIN\0" else b""
-        except (ValueError, struct.error, AttributeError) as error:
-            raise ValueError(f"{path}: not a whole .glb file ({error}): export it again") from error
+        except (ValueError, struct.error, AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not a whole {path.suffix.lower()} file ({error}): export it again") from error
         if packed := set(self.document.get("extensionsRequired", [])) & set(PACKED):
             raise ValueError(f"{path}: its motion is compressed ({min(packed)}): export it without compression")
 
@@ -87,16 +82,54 @@ class GltfFile:
         return values
 
     def _buffer(self, index: int) -> bytes:
-        said = self.document["buffers"][index].get("uri")
-        if said is None:
-            return self.binary
+        if index not in self._buffers:
+            said = self.document["buffers"][index].get("uri")
+            self._buffers[index] = self.binary if said is None else self._linked(said, "numbers are")
+        return self._buffers[index]
+
+    def _linked(self, said: str, what: str) -> bytes:
+        """What a URI stands for: bytes in itself, or a file in the folder of this one."""
         head, comma, content = said.partition(",")
-        if not (comma and head.startswith("data:") and head.endswith(";base64")):
-            raise ValueError(f"its numbers are in another file ({said:.40}); expected them in this one")
-        try:
-            return base64.b64decode(content, validate=True)
-        except binascii.Error as error:
-            raise ValueError(str(error)) from error
+        if comma and head.startswith("data:") and head.endswith(";base64"):
+            try:
+                return base64.b64decode(content, validate=True)
+            except binascii.Error as error:
+                raise ValueError(str(error)) from error
+        place = self.path.parent / unquote(said)
+        # What lies elsewhere would be put into files that are passed on.
+        if not place.resolve().is_relative_to(self.path.parent.resolve()) or not place.is_file():
+            raise ValueError(f"its {what} in another file ({said:.40}), which is not beside it: keep both together")
+        return regular(place).read_bytes()
+
+    def in_one(self) -> tuple[dict[str, Any], bytearray]:
+        """A copy of the document, and its one buffer, which holds what was in several and in files of pictures."""
+        document, binary = copy.deepcopy(self.document), bytearray()
+
+        def add(data: bytes) -> int:
+            binary.extend(bytes(-len(binary) % 4))
+            binary.extend(data)
+            return len(binary) - len(data)
+
+        begins = [add(self._buffer(k)) for k in range(len(document.get("buffers", [])))]
+        views = document.setdefault("bufferViews", [])
+        for view in views:
+            for part in (view, *view.get("extensions", {}).values()):
+                part["byteOffset"] = part.get("byteOffset", 0) + begins[part["buffer"]]
+                part["buffer"] = 0
+        for image in document.get("images", []):
+            if (said := image.pop("uri", None)) is not None:
+                data = self._linked(said, "pictures are")
+                image.setdefault("mimeType", mimetypes.guess_type(said)[0] or "image/png")
+                image["bufferView"] = len(views)
+                views.append({"buffer": 0, "byteOffset": add(data), "byteLength": len(data)})
+        return document, binary
+
+    @cached_property
+    def roles(self) -> dict[int, str]:
+        """What VRM says that bones are, such as leftUpperLeg, by their nodes; empty in other files."""
+        said = self.document.get("extensions", {})
+        each = [_bones(said, name) for name in ("VRM", "VRMC_vrm", "VRMC_vrm_animation")]
+        return {bone["node"]: name for bones in each for name, bone in bones.items()}
 
     @cached_property
     def parents(self) -> dict[int, int]:
@@ -125,7 +158,7 @@ class GltfFile:
         return found
 
     def name(self, node: int) -> str:
-        return str(self.nodes[node].get("name") or f"node{node}")
+        return str(self.roles.get(node) or self.nodes[node].get("name") or f"node{node}")
 
     def resting(self, node: int) -> dict[str, Floats]:
         """A node's own translation (3,), rotation (4,) as x y z w, and scale (3,), where nothing moves it."""
@@ -146,6 +179,33 @@ class GltfFile:
             said = self.resting(each)
             whole = matrices(*(said[what][None] for what in DEFAULTS))[0] @ whole
         return whole
+
+
+def _opened(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The document of a file, and the bytes that a binary one holds behind it."""
+    if data.lstrip()[:1] == b"{":
+        document = json.loads(data)
+        if document["asset"]["version"][:2] != "2.":
+            raise ValueError(f"it is glTF {document['asset']['version']}, expected 2.0")
+        return document, b""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    if magic != b"glTF" or version != 2 or kind != b"JSON":
+        raise ValueError("it does not begin as glTF 2.0 does")
+    if length > len(data):
+        raise ValueError(f"it says that it has {length} bytes, and has {len(data)}")
+    begin = 20 + size
+    document = json.loads(data[20:begin])
+    if len(data) <= begin:
+        return document, b""
+    count, kind = struct.unpack_from("<I4s", data, begin)
+    return document, data[begin + 8 : begin + 8 + count] if kind == b"BIN\0" else b""
+
+
+def _bones(extensions: dict[str, Any], name: str) -> dict[str, Any]:
+    """The bones that an extension of VRM names; version 0 lists them."""
+    bones = extensions.get(name, {}).get("humanoid", {}).get("humanBones", {})
+    return {bone["bone"]: bone for bone in bones} if isinstance(bones, list) else bones
 
 
 def matrices(translation: Floats, rotation: Floats, scale: Floats) -> Floats:

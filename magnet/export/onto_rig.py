@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from magnet.export.bvh import bvh_text, depth_first, euler_zxy, paths_of
 from magnet.export.bvh_read import read_bvh
 from magnet.export.fbx import as_fbx, converted
 from magnet.export.glb import FLOAT, animation, frame_times, packed, standing, unbroken
-from magnet.export.glb_read import GlbRig, read_rig
+from magnet.export.glb_read import GlbRig, in_one_line, read_rig
 from magnet.export.gltf_file import matrices
 from magnet.export.retarget import rests_aligned, sources
 from magnet.export.rig import UP, Skeleton, rest_frame, understood
@@ -72,8 +71,8 @@ def save_onto(
     have not (fingers, twists, faces) stay as they rest on the one above.
 
     Args:
-        rigs: files of one character each, of the path's suffix, .bvh, .glb or .fbx: one for everybody, or one for each
-            person present.
+        rigs: files of one character each, of a kind that `RIGS_FOR` has for the path's suffix: one for everybody, or
+            one for each person present.
 
     Returns:
         The paths written.
@@ -88,11 +87,10 @@ def save_onto(
     path, suffix = Path(path), Path(path).suffix.lower()
     slots, people = scene.present[0].nonzero()[:, 0].tolist(), scene.people()
     files = [Path(rig) for rig in rigs]
-    if suffix not in WRITERS or {file.suffix.lower() for file in files} != {suffix}:
+    if not {file.suffix.lower() for file in files} <= set(RIGS_FOR.get(suffix, ())):
         names = ", ".join(file.name for file in files)
-        raise ValueError(
-            f"a character is written as it was read: got {names} for {path.name}; use {', '.join(WRITERS)}"
-        )
+        ways = ", ".join(f"{rig} to {to}" for to, kinds in RIGS_FOR.items() for rig in kinds)
+        raise ValueError(f"a character is written as it was read: got {names} for {path.name}; {ways}")
     for file in files:
         if not file.is_file():
             raise FileNotFoundError(f"{file}: no such file")
@@ -203,9 +201,8 @@ def _onto_glb(scene: Scene, path: Path, body: Body, rig: Path, options: RigOptio
 def _animated(character: GlbRig, moved: Moved, frames: int, fps: float) -> bytes:
     """The character's file with one animation, in place of those that it had."""
     file, joints = character.file, character.joints
-    document, binary = copy.deepcopy(file.document), bytearray(file.binary)
-    if len(document.get("buffers", [])) != 1 or "uri" in document["buffers"][0]:
-        raise ValueError(f"{file.path}: its numbers are in several parts; export it as one .glb")
+    with in_one_line(file.path):
+        document, binary = file.in_one()
 
     def accessor(array: Any, kind: str, **more: Any) -> int:
         data = np.ascontiguousarray(array, dtype="<f4")
@@ -219,7 +216,7 @@ def _animated(character: GlbRig, moved: Moved, frames: int, fps: float) -> bytes
             "count": len(data),
             "type": kind,
         }
-        document["accessors"].append(item | more)
+        document.setdefault("accessors", []).append(item | more)
         return len(document["accessors"]) - 1
 
     times = frame_times(frames, fps)
@@ -276,4 +273,7 @@ WRITERS: dict[str, Callable[[Scene, Path, Body, Path, RigOptions], None]] = {
     ".glb": _onto_glb,
     ".fbx": _onto_fbx,
 }
-"""Suffixes of characters, and what writes them."""
+"""Suffixes, and what writes characters so."""
+
+RIGS_FOR = {".bvh": (".bvh",), ".glb": (".glb", ".gltf", ".vrm"), ".fbx": (".fbx",)}
+"""The characters that can be written with a suffix."""

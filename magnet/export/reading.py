@@ -12,6 +12,7 @@ from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_flag, require_number, require_whole
 from magnet.export.cutting import rates_note
 from magnet.export.formats import MOST_FPS, WRITTEN
+from magnet.export.gltf_file import GLTF
 from magnet.export.joints_read import load_joints
 from magnet.export.npz_files import is_ours, read_people
 from magnet.export.retarget import load_rigs, together
@@ -166,7 +167,7 @@ def shared(options: Reading, *groups: Sequence[str | Path]) -> list[Reading]:
 def _suits(file: Path) -> set[str]:
     """The options that only some kinds of file take, and this one does."""
     if file.suffix.lower() in RIGS:
-        return {"unit", "up", "joints", *(["clip"] if file.suffix.lower() == ".glb" else [])}
+        return {"unit", "up", "joints", *(["clip"] if file.suffix.lower() in GLTF else [])}
     if file.suffix.lower() == TABLE:
         return {"unit", "up", "joints", "in_fps"}
     return set() if is_ours(file) else {"unit", "up", "in_fps"}

@@ -1,4 +1,4 @@
-"""Files of skeletons in motion by their suffix: BVH, GLB, and FBX through Blender."""
+"""Files of skeletons in motion by their suffix: BVH, glTF and VRM, and FBX through Blender."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from magnet.export.bvh_read import read_bvh
 from magnet.export.cutting import kept_frames
 from magnet.export.fbx import converted
 from magnet.export.glb_read import read_glb
+from magnet.export.gltf_file import GLTF
 from magnet.export.rig_motion import RigMotion
 from magnet.files import regular
 
@@ -32,7 +33,7 @@ def read_rigs(path: str | Path, start: int = 0, end: int | None = None, clip: st
     path = Path(path)
     if clip is None:
         return RIGS[path.suffix.lower()](path, start, end)
-    if path.suffix.lower() != ".glb":
+    if path.suffix.lower() not in GLTF:
         raise ValueError(f"{path}: clip: chooses an animation of a .glb; a .bvh has one, of an .fbx write a .glb")
     return read_glb(path, start, end, clip)
 
@@ -70,5 +71,9 @@ def _takes(glb: Path) -> list[str]:
     return [f"of {who} the take {kept!r} is read, not {', '.join(others)}" for (who, kept), others in left.items()]
 
 
-RIGS: dict[str, Callable[[Path, int, int | None], list[RigMotion]]] = {".bvh": _bvh, ".glb": read_glb, ".fbx": _fbx}
+RIGS: dict[str, Callable[[Path, int, int | None], list[RigMotion]]] = {
+    ".bvh": _bvh,
+    **dict.fromkeys(GLTF, read_glb),
+    ".fbx": _fbx,
+}
 """Suffixes, and what reads them."""

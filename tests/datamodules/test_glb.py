@@ -22,6 +22,7 @@ from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.store.windows import recorded_windows
 from magnet.export import fbx, save_bvh, save_glb
+from magnet.export.formats import write
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
 from tests.export import glb_strangers
@@ -77,6 +78,16 @@ def test_files_of_a_person_each_go_together_by_their_names(tmp_path: Path) -> No
         reader.read(take)
 
 
+def test_vrm_animations_of_a_couple_are_one_scene(tmp_path: Path) -> None:
+    scene = duet()
+    write(scene, tmp_path / "walk.vrma")
+    reader = GLBReader(tmp_path)
+    assert reader.summary()[0] == "1 scene of 2 files: walk (person0, person1)"
+    found = reader.read(reader.found()[0])
+    joints = load_body().joints(scene)[0, :, :, list(found.joints)]
+    np.testing.assert_allclose(found.positions, joints, atol=1e-4)
+
+
 def test_files_that_differ_in_their_suffix_alone_are_named(tmp_path: Path) -> None:
     for name in ("walk.glb", "walk.fbx", "run.glb"):
         (tmp_path / name).touch()
@@ -93,7 +104,7 @@ def test_a_folder_that_holds_bvh_too_is_not_read_as_both(
     save_bvh(duet(), "dl/duet.bvh", load_body())
     words = ["data", "check", "dl", "--workers", "1", "--picture", "none", "--trust_fps", "--min_frames", "4"]
     assert cli.main(words) == 2
-    said = "dl could be bvh or glb: say which with --name; bvh reads .bvh and glb reads .glb and .fbx alone"
+    said = "dl could be bvh or glb: say which with --name; bvh reads .bvh and glb reads .glb .gltf .vrma .fbx alone"
     assert said in capsys.readouterr().err
     assert cli.main([*words, "--name", "glb"]) == 0
     assert "all assertions hold" in capsys.readouterr().out

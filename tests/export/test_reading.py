@@ -216,7 +216,7 @@ def test_whoever_really_lies_is_read_with_the_axis_that_is_said(tmp_path: Path) 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usd", ".html"])
 def test_what_is_only_written_is_said_to_be_so(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"\(.bvh, .glb, .fbx\); {suffix} can be written but"):
+    with pytest.raises(ValueError, match=rf"\(.bvh, .glb, .gltf, .vrm, .vrma, .fbx\); {suffix} can be written but"):
         reading.read(tmp_path / f"a{suffix}")
 
 

@@ -183,7 +183,7 @@ def recognise(root: Path) -> str:
         return found[0]
     if found:
         own = [kind for name in found if issubclass(kind := registry.reader(name), OwnReader)]
-        reads = " and ".join(f"{kind.name} reads {' and '.join(kind.suffixes)}" for kind in own)
+        reads = " and ".join(f"{kind.name} reads {' '.join(kind.suffixes)}" for kind in own)
         alone = f"; {reads} alone, each as scenes of its own" if own else ""
         raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name{alone}")
     raise ValueError(
