@@ -104,7 +104,9 @@ def test_a_folder_that_holds_bvh_too_is_not_read_as_both(
     save_bvh(duet(), "dl/duet.bvh", load_body())
     words = ["data", "check", "dl", "--workers", "1", "--picture", "none", "--trust_fps", "--min_frames", "4"]
     assert cli.main(words) == 2
-    said = "dl could be bvh or glb: say which with --name; bvh reads .bvh and glb reads .glb .gltf .vrma .fbx alone"
+    said = (
+        "dl could be bvh or glb: say which with --name; bvh reads .bvh and glb reads .glb, .gltf, .vrma and .fbx alone"
+    )
     assert said in capsys.readouterr().err
     assert cli.main([*words, "--name", "glb"]) == 0
     assert "all assertions hold" in capsys.readouterr().out

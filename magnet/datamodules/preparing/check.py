@@ -171,6 +171,11 @@ def _scenes(folder: StoreReader, part: StoreSplit, most: int) -> list[tuple[str,
 # -- a download --------------------------------------------------------------------------------
 
 
+def _all(words: Sequence[str]) -> str:
+    """a, b and c"""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
 def recognise(root: Path) -> str:
     """Which data set's layout lies under a folder.
 
@@ -183,7 +188,7 @@ def recognise(root: Path) -> str:
         return found[0]
     if found:
         own = [kind for name in found if issubclass(kind := registry.reader(name), OwnReader)]
-        reads = " and ".join(f"{kind.name} reads {' '.join(kind.suffixes)}" for kind in own)
+        reads = " and ".join(f"{kind.name} reads {_all(kind.suffixes)}" for kind in own)
         alone = f"; {reads} alone, each as scenes of its own" if own else ""
         raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name{alone}")
     raise ValueError(
