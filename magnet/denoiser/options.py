@@ -203,6 +203,7 @@ class Sampling:
         opening: more denoising steps at the highest noise where nothing in a window is known.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
+        together: metres that couples stay within where scenes go on for long.
         noise_scale: standard deviation of the new noise in each denoising step.
         stabilization_level: noise level at which it is shown what it has made.
         stabilization_after: token steps after the last given one that are shown clean too.
@@ -216,6 +217,7 @@ class Sampling:
     opening: int | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
+    together: float | None = None
     noise_scale: float | None = None
     stabilization_level: int | None = None
     stabilization_after: int = 0

@@ -122,7 +122,7 @@ class CrowdRollout(Rollout):
             self._partner_radii = options.crowd_enter, options.crowd_leave
             beside = replace(options.guidance, stabilization_beside=0)  # somebody who is given may be far away
             apart = "firm" if options.apart == "off" else options.apart
-            options = replace(options, settle="off", apart=apart, guidance=beside)
+            options = replace(options, settle="off", apart=apart, guidance=beside, together=0.0)
         self.viewer, self.model = model, copy.copy(model)  # the same weights with tokens of another layout
         self.model.denoise = self._denoise_in_views  # type: ignore[method-assign, assignment]
         self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with

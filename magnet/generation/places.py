@@ -62,8 +62,8 @@ class Places:
 
         What is left is a view of what was, which goes when rows are added.
         """
-        frames = rows * TOKEN_FRAMES
-        if self.options.guidance.stabilization_level or self.options.guidance.stabilization_unseen:
+        frames, guidance = rows * TOKEN_FRAMES, self.options.guidance
+        if self.options.together or guidance.stabilization_level or guidance.stabilization_unseen:
             self.since = steps_since(self.known[:rows], self.since)
         self.rooted |= bool(self.known[:rows].any())
         self.finalized, self.released = max(self.finalized - rows, 0), self.released + rows

@@ -10,13 +10,15 @@ from torch import Tensor
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.causal_bodies import finalized_bodies
 from magnet.generation.chunk_bodies import chunk_bodies
+from magnet.generation.couples import LONG, Couples
 from magnet.generation.places import Places
 from magnet.generation.separation import Decode, separated
 from magnet.generation.settling import LEAD, Corrected, settled_block
 from magnet.generation.stats import SamplingStats
-from magnet.motion.frames import canonical_frame, pairwise, to_9d
+from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
+from magnet.sampling.faint import shown_clean
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
@@ -48,6 +50,7 @@ class WorldState(Places):
         self.correction: Corrected | None = None  # of the last two frames shown, in causal plans
         self.uncorrected: Scene | None = None  # the same two frames before they were corrected
         self.chunk_correction: Corrected | None = None  # of the chunk before, in all other plans
+        self.couples = Couples(options.together) if options.together and not self.causal else None
         self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
         self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
@@ -71,6 +74,8 @@ class WorldState(Places):
         moved = self.place_all(deltas, near, finished, first, stop, placement)
         if self.steer is not None:
             self.steer(slice(first, stop), finished[first:stop])
+        if self.couples is not None:
+            self._lead(self.couples, finished, first, stop)
         if self.options.apart != "off":
             self._separate(tokens, latent, finished, first, stop, decentralized)
         if self.options.settle_blocks and self.settle is not None:
@@ -118,6 +123,20 @@ class WorldState(Places):
     def _unseen(self, row: int) -> Tensor:
         """Who is given at a token step and not shown to everybody whose block it is. -> (P,) bool"""
         return self.known[row] & ~self.saw.all(dim=0) if self.causal else torch.zeros_like(self.known[row])
+
+    def _lead(self, couples: Couples, finished: Tensor, first: int, stop: int) -> None:
+        """Lead couples back together in what is made long after what was given, but not on the way to a keyframe."""
+        rows = slice(first, stop)
+        long = ~shown_clean(self.known, LONG, self.since)[rows]
+        new = finished[rows] & long & ~self.known[stop] if stop < len(self.known) else finished[rows] & long
+        frames, lead = slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES), int(first == 0)
+        around = self.T_world_can[:, frames.start - 1 + lead : frames.stop, :, [0, 2], 3]
+        around = torch.cat([around[:, :1], around], dim=1) if lead else around
+        moved = couples.led(around, self.rows_by_frame(new), self.given.present)
+        T_new_world = from_planar(torch.zeros_like(moved[..., 0]), moved)
+        led = (moved != 0).any(dim=-1)[..., None, None]
+        now = self.T_world_can[:, frames]
+        self.T_world_can[:, frames] = torch.where(led, T_new_world @ now, now)
 
     def _separate(
         self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool

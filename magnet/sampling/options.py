@@ -74,6 +74,10 @@ class SamplerOptions:
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
             the one after the last is as it is expected. And people go on from what is given as fast as they went, in
             live tasks from each token to the next. None: as the model is best sampled, or not.
+        together: metres over the ground that couples stay within where scenes go on for long (ours,
+            `magnet.generation.couples`): from three quarters of it on ways apart are shortened and people come slowly
+            back, in what is made more than 36 token steps after what was given; not in live tasks and crowds. 0: nobody
+            is led. None: as the model is best sampled, or 0.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
@@ -117,6 +121,7 @@ class SamplerOptions:
     apart: Separation = "off"
     body_guidance: Separation = "off"
     settle: Settling | None = None
+    together: float | None = None
     settle_blocks: bool = False
     smooth_path: bool | None = None
     requantize: bool | None = None
@@ -159,6 +164,8 @@ class SamplerOptions:
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
         require_number("crowd_spacing", self.crowd_spacing, over=0)
         require_number("eta", self.eta, 0, 1)
+        if self.together is not None:
+            require_number("together", self.together, least=0)
         if self.noise_scale is not None:
             require_number("noise_scale", self.noise_scale, over=0, most=2)
             if self.noise_scale != 1 and not self.eta:

@@ -11,7 +11,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # The default before: it loses a quarter of the variance, and with it much of what the shipped model gets wrong.
     "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even", "opening": 0},
     # What the model makes, and nothing corrected after it.
-    "plain": {"settle": "off", "smooth_path": False},
+    "plain": {"settle": "off", "smooth_path": False, "together": 0.0},
     # Without rolling, for any model.
     "strides": {"stride": 12, "pyramid_offset": 0},
     "paper": {
@@ -51,6 +51,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "apart": "off",  # the paper moves nobody out of another
         "body_guidance": "off",  # the paper's guidance knows of no bodies
         "settle": "off",  # and corrects no pose
+        "together": 0.0,
         "settle_blocks": False,
         "smooth_path": False,
     },
