@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from magnet.agents.message import POSE, TOKEN, Message, RefusedMessage, unpack
+from magnet.motion.scene import FPS
 
 FAR = 1000.0
 """Metres from the origin, at most."""
@@ -52,7 +54,7 @@ class Gate:
         self.rate, self.burst = rate, burst
         self.taken, self.passed_over, self.refused = 0, 0, Counter[str]()
         self.now: int | None = None
-        self._sessions: dict[str, int] = {}
+        self._sessions: dict[str, tuple[int, float]] = {}  # whose newest process that is, and when it was last heard
         self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
         # Where whose pelvis was by whom, by frame. What one sender tells of another binds nobody else.
         self._places: dict[tuple[str, str], dict[int, np.ndarray]] = {}
@@ -71,11 +73,13 @@ class Gate:
             if message.agent not in (message.sender, self.me):
                 self.passed_over += 1
                 return None
+            if message.model != self.model:  # who has other weights does not understand it
+                message = replace(message, model="", token=None)
             self._numbers(message)
         except RefusedMessage as reason:
             self.refused[str(reason)] += 1
             return None
-        self._sessions[message.sender] = message.session
+        self._sessions[message.sender] = message.session, at
         self._note(message)
         self.taken += 1
         return message
@@ -86,7 +90,8 @@ class Gate:
             raise RefusedMessage("sender")
         if message.agent not in self.names:
             raise RefusedMessage("agent")
-        if message.session < self._sessions.get(sender, 0):
+        session, heard = self._sessions.get(sender, (0, at))
+        if message.session < session and at - heard <= GONE / FPS:  # later a clock may have gone back, as at a start
             raise RefusedMessage("session")
         left, since = self._left.get(sender, (self.burst, at))
         left = min(self.burst, left + self.rate * max(at - since, 0.0))
@@ -113,7 +118,7 @@ class Gate:
             lengths = np.linalg.norm(units.astype(np.float64), axis=2)
         if (np.abs(lengths - 1) > UNIT).any():
             raise RefusedMessage("rotation")
-        if message.token is not None and message.model == self.model:
+        if message.token is not None:
             self._token(message.token, place)
 
     def _jumps(self, message: Message) -> bool:

@@ -143,7 +143,18 @@ def test_who_sends_too_fast_for_somebody_else_or_from_an_ended_process_is_not_he
 
 def test_a_token_of_another_model_does_not_matter_and_the_poses_are_taken():
     sent = dataclasses.replace(message(), model="other", token=np.full(9999, np.nan, np.float32))
-    assert gate().take(pack(sent), 0.0) is not None
+    taken = gate().take(pack(sent), 0.0)
+    assert taken is not None and taken.token is None and taken.model == ""
+    assert np.array_equal(taken.poses, sent.poses)
+
+
+def test_who_starts_again_with_a_clock_that_went_back_is_heard_once_it_was_silent_for_as_long_as_who_is_gone():
+    """A robot without a battery for its clock begins at 1970; as long as the other process is heard, it stays out."""
+    ours = gate()
+    older = pack(dataclasses.replace(message(), session=3))
+    assert ours.take(pack(message()), 0.0) and ours.take(older, 2.0) is None
+    assert ours.take(older, 2.2) and ours.take(pack(message()), 2.3), "a later session replaces at once"
+    assert ours.take(older, 4.4) is None and dict(ours.refused) == {"session": 2}
 
 
 def test_what_is_told_somebody_else_of_its_past_is_neither_taken_nor_refused():
