@@ -122,9 +122,13 @@ class Notebook:
         """Whether a token has come whole."""
         return index in self.pieces[slot] and bool(self.pieces[slot][index].there.all())
 
+    def last(self, slot: int) -> int:
+        """The newest token that has come of somebody."""
+        return max((index for index in self.pieces[slot] if self.come(slot, index)), default=-1)
+
     def newest(self) -> int:
         """The newest token that has come of anybody else."""
-        return max((i for slot in self.others() for i in self.pieces[slot] if self.come(slot, i)), default=-1)
+        return max(map(self.last, self.others()), default=-1)
 
     def others(self) -> list[int]:
         return [slot for slot in range(len(self.names)) if slot != self.me]

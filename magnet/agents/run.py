@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from magnet.agents.agent import Member
+from magnet.agents.agent import PAST, Member
 from magnet.agents.gate import Gate
 from magnet.agents.message import TOKEN, Message, pack
 from magnet.motion.scene import FPS
@@ -237,7 +237,7 @@ class Process:
                 earliest, latest = pace.due(index) - PERIOD, pace.due(index) - 1.2 * cost
                 wait = (latest if member.awaited() else min(earliest, latest)) - now
             else:
-                wait = given_up - now if member.awaited() else 0.0
+                wait = given_up - now if member.awaited() or self._ahead() else 0.0
             if wait <= 0:
                 break
             self.listen(min(wait, 0.05))
@@ -256,6 +256,11 @@ class Process:
             self.report.late += late > 0
         self.kept(message)
         return True
+
+    def _ahead(self) -> bool:
+        """Whether somebody lags a token behind and is not gone: a recording, which awaits nobody, keeps their pace."""
+        told = (self.member.last(self.member.names.index(name)) for name in self._heard)
+        return any(self.member.next - PAST <= last < self.member.next - 1 for last in told)
 
     def run(self, tokens: int | None = None) -> dict[str, Any]:
         """Take part for so many tokens, or until it is over. Returns the report."""

@@ -106,3 +106,23 @@ def test_where_the_clock_runs_slower_tokens_are_due_later_and_nothing_else_chang
         took.append(line.now - begun)
     assert took[1] == pytest.approx(4 * took[0], rel=0.02)
     assert reports[0]["late"] == reports[1]["late"] == 0 and reports[1]["tokens"] == 10
+
+
+def test_a_recording_keeps_the_pace_of_the_others_where_that_is_asked_for():
+    """What is ten seconds ahead of the others would be refused by them."""
+    line = Line([])
+    process, member = played(line, 0)
+    process.meet, process.real_time = 0.0, False
+    process.begin()
+    line.coming.append(("A", pack(Message("hello", "A", "A", 0, -1, 0.0))))
+    process.listen(0.0)
+    assert process.turn() and line.now < 1.0
+    assert process.turn() and line.now > process.patience, "A has not told its first token, and is waited for"
+    told, _ = played(line, 2)
+    assert told.member is not member
+    begun = line.now
+    assert process.turn() and member.next == 3 and line.now - begun < 1.0
+    for _ in range(20):
+        process.turn()
+    begun = line.now
+    assert process.turn() and line.now == pytest.approx(begun), "who is gone is not waited for"
