@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,8 @@ from magnet.agents.message import LARGEST, VERSION
 
 QUEUE = 64
 """Messages that wait for somebody who does not read; after that they are lost."""
+SILENT = 10.0
+"""Seconds after which whoever is silent is connected to anew."""
 HERE = re.compile(r"ipc://.+|inproc://.+|tcp://(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+")
 
 
@@ -67,7 +70,7 @@ class Link:
         zmq = self._zmq
         self.out = self.context.socket(zmq.PUB)
         self.out.set_hwm(QUEUE)
-        self.out.linger = 0
+        self.out.linger, self.out.ipv6 = 0, "[" in listen
         mine: tuple[Any, Any] | None = None
         if keys is not None:
             import zmq.auth
@@ -81,11 +84,12 @@ class Link:
             self.out.curve_server = True
         self.out.bind(listen)
         self.poller = zmq.Poller()
-        self.inn: dict[Any, str] = {}
+        self.inn: dict[Any, tuple[str, str]] = {}  # sockets, and of whom and where they hear
+        self._last: dict[Any, float] = {}
         for other, address in connect.items():
             socket = self.context.socket(zmq.SUB)
             socket.set_hwm(QUEUE)
-            socket.linger = 0
+            socket.linger, socket.ipv6 = 0, "[" in address
             socket.maxmsgsize = LARGEST
             if keys is not None and mine is not None:
                 socket.curve_publickey, socket.curve_secretkey = mine
@@ -93,7 +97,7 @@ class Link:
             socket.subscribe(b"magnet/")
             socket.connect(address)
             self.poller.register(socket, zmq.POLLIN)
-            self.inn[socket] = other
+            self.inn[socket], self._last[socket] = (other, address), time.monotonic()
 
     def send(self, parts: list[bytes]) -> None:
         """Tell all who listen; never waits."""
@@ -105,10 +109,20 @@ class Link:
         for socket, _ in self.poller.poll(max(int(1000 * seconds), 0)):
             for _ in range(QUEUE):
                 try:
-                    found.append((self.inn[socket], socket.recv_multipart(self._zmq.NOBLOCK)))
+                    found.append((self.inn[socket][0], socket.recv_multipart(self._zmq.NOBLOCK)))
                 except self._zmq.Again:
                     break
+            self._last[socket] = time.monotonic()
+        self._renew()
         return found
+
+    def _renew(self) -> None:
+        """Connect anew to who is silent: after one message over its size ZeroMQ hears nothing of an address again."""
+        for socket, (_, address) in self.inn.items():
+            if (now := time.monotonic()) - self._last[socket] > SILENT:
+                self._last[socket] = now
+                socket.disconnect(address)
+                socket.connect(address)
 
     def close(self) -> None:
         if self._guard is not None:

@@ -13,11 +13,12 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from magnet.agents.agent import poses_of
-from magnet.agents.message import unpack
+from magnet.agents.message import POSE, Message, pack, unpack
 from magnet.agents.zeromq import Link, engine, make_keys
 from magnet.cli import agent
 from magnet.cli.agent import peers
@@ -135,12 +136,34 @@ def test_three_go_on_when_one_is_killed_and_it_comes_back(folder):
     assert back["joined"] * 4 >= at["D"] and back["tokens"] == 30 and back["refused"] == {}
 
 
-@pytest.mark.slow
-def test_the_client_in_the_docs_is_heard_and_hears(folder):
-    """As it stands there, in a process of its own, without this package."""
+def client_in_the_docs(folder: Path) -> None:
+    """Write it down as client.py."""
     block = next(part.split("```")[0] for part in DOCS.read_text().split("```python\n")[1:] if "OTHERS" in part)
     assert "import magnet" not in block and sum(bool(line.strip()) for line in block.splitlines()) <= 60
     (folder / "client.py").write_text(block)
+
+
+def test_the_client_in_the_docs_begins_where_the_others_are_and_not_with_what_it_is_told_of_before(tmp_path):
+    client_in_the_docs(tmp_path)
+    addresses = addresses_of("AB")
+    link = Link("A", addresses["A"], {"B": addresses["B"]})
+    client = subprocess.Popen([sys.executable, "client.py", "B", addresses["B"], addresses["A"]], cwd=tmp_path)
+    poses, heard, end = np.zeros((4, POSE), np.float32), [], time.monotonic() + 60
+    while not any(message.kind == "frames" for message in heard) and time.monotonic() < end:
+        heard += [unpack(parts) for _, parts in link.receive(0.05)]
+        if len(heard) == 1:  # its first hello, answered with ten tokens
+            for index in range(10):
+                link.send(pack(Message("frames", "A", "A", 1, 4 * index, 0.0, poses=poses)))
+    client.kill()
+    client.wait()
+    link.close()
+    assert heard[-1].kind == "frames" and heard[-1].frame == 40
+
+
+@pytest.mark.slow
+def test_the_client_in_the_docs_is_heard_and_hears(folder):
+    """As it stands there, in a process of its own, without this package."""
+    client_in_the_docs(folder)
     addresses = addresses_of("AB")
     agent = started(folder, 2, "A", addresses, "--seconds", "3", "--meet", "6")
     client = subprocess.Popen(
@@ -210,6 +233,51 @@ def test_with_keys_members_hear_each_other_and_strangers_hear_nothing(tmp_path):
     assert stranger.receive(0.2) == [] and plain.receive(0.1) == []
     for link in (one, two, stranger, plain):
         link.close()
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
+def test_an_address_of_this_machine_may_be_of_ipv6() -> None:
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6) as probe:
+            address = f"tcp://[::1]:{probe.getsockname()[1]}"
+    except OSError:
+        pytest.skip("no IPv6 address of this machine")
+    one = Link("A", address, {})
+    two = Link("B", addresses_of("B")["B"], {"A": address})
+    end, heard = time.monotonic() + 10, []
+    while not heard and time.monotonic() < end:
+        one.send([b"magnet/A", b"hello"])
+        heard = two.receive(0.05)
+    assert heard[0] == ("A", [b"magnet/A", b"hello"])
+    one.close()
+    two.close()
+
+
+def test_who_sent_a_message_over_the_size_is_heard_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ gives up an address then: its next process would not be heard, either."""
+    monkeypatch.setattr("magnet.agents.zeromq.SILENT", 0.3)
+    zmq, addresses = engine(), addresses_of("AB")
+    link = Link("A", addresses["A"], {"B": addresses["B"]})
+    link.receive(0.5)  # nobody is there yet
+    context = zmq.Context()
+    out = context.socket(zmq.PUB)
+    out.bind(addresses["B"])
+
+    def hears() -> bool:
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            out.send_multipart([b"magnet/B", b"hello"])
+            if link.receive(0.05):
+                return True
+        return False
+
+    assert hears()
+    out.send_multipart([b"magnet/B", b"x" * 70_000])
+    while link.receive(0.2):
+        pass
+    assert hears()
+    link.close()
+    context.destroy(linger=0)
 
 
 def relayed(stop: threading.Event, source: str, address: str, lossy: Lossy) -> None:
