@@ -38,6 +38,12 @@ ROOM = 0.75
 """Metres around pelvises that the camera keeps visible."""
 
 
+def has_picture(camera: Any) -> bool:
+    """Whether a browser's picture has a size, which a folded frame's has not, and its camera a place."""
+    numbers = np.array([*camera.position, *camera.look_at, camera.fov, camera.image_height], dtype=float)
+    return bool(np.isfinite(numbers).all()) and min(camera.fov, camera.image_height) > 0 and camera.aspect > 0
+
+
 class ViewerBase:
     """Server, floor, clock, the people, and their controls.
 
@@ -108,13 +114,10 @@ class ViewerBase:
                 self.clock.step(far[steps.value] if steps.value in far else int(steps.value))
             self._update_play()
 
-        def set_speed(_: Any) -> None:
-            self.clock.speed = float(speed.value[:-1])
-
         self.slider.on_update(seek)
         self.play.on_click(press)
         steps.on_click(step)
-        speed.on_update(set_speed)
+        speed.on_update(lambda _: self.clock.set_speed(speed.value))
         loop.on_update(lambda _: self.set_loop(bool(loop.value)))
 
     def set_loop(self, on: bool) -> None:
@@ -281,6 +284,8 @@ class ViewerBase:
         reach = max(float(np.linalg.norm(away[:, [0, 2]], axis=1).max()) + ROOM, 1.2)
         for client in self.server.get_clients().values():
             camera, middle = client.camera, np.array([0.0, AIM, 0.0])
+            if not has_picture(camera):
+                continue
             come = client.client_id not in self.placed
             if come:
                 if not np.allclose(camera.look_at, middle, atol=1e-3):

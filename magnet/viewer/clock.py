@@ -36,6 +36,11 @@ class Clock:
                     self.at, self.playing = float(self.frames - 1), False
         return self.frame
 
+    def set_speed(self, name: str) -> None:
+        """Play at one of `SPEEDS`; others, which viser passes on from clients as they come, change nothing."""
+        if name in SPEEDS:
+            self.speed = float(name.removesuffix("x"))
+
     def seek(self, frame: int) -> None:
         """Go to a frame, clamped to the first and the last."""
         self.at = float(min(max(frame, 0), max(self.frames - 1, 0)))

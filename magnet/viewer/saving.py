@@ -21,7 +21,10 @@ def saved(take: ShownTake, body: Body, kind: str, truth: Scene | None = None) ->
 
     Raises:
         ImportError: the format needs an optional package; says which.
+        ValueError: another format; viser passes on whatever a client sends, and this one names a file.
     """
+    if kind not in FORMATS:
+        raise ValueError(f"format: got {kind!r}, expected {', '.join(FORMATS)}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene.{kind}"
         if kind == "html":

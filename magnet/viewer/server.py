@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import http
+import ipaddress
 import os
 import socket
 import sys
+from collections.abc import Iterator
 from typing import Any
+from urllib.parse import urlsplit
 
 AT_ONCE = "Object.defineProperty(document, 'hidden', {configurable: true, get: () => true})"
 TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
@@ -22,19 +26,74 @@ def start(host: str, port: int, title: str) -> Any:
     """Start a viser server on exactly this port; port 0 takes a free one.
 
     Raises:
-        ImportError: viser is not installed.
+        ImportError: viser is not installed, or starts otherwise than the versions that are known.
         OSError: the port is taken, or the host is not this machine.
     """
     viser = require_viser()
     port = free_port(host, port)
     # viser greets with a box of its own; ours says more.
-    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        own_pages_only(is_local(host)),
+    ):
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if server.get_port() != port:
         server.stop()
         raise OSError(taken(host, port))
     server.gui.add_html(TOGETHER)
     return server
+
+
+def is_local(name: str | None) -> bool:
+    """Whether a host is this machine and nobody else reaches it."""
+    try:
+        return name == "localhost" or ipaddress.ip_address(name or "").is_loopback
+    except ValueError:
+        return False
+
+
+def is_foreign(origin: str | None, asked: str, local: bool) -> bool:
+    """Whether a page of another server asks: in somebody's browser it could read and steer what is shown.
+
+    origin: of the page, None where no browser asks. asked: the host that it asks for. local: that is to be this
+    machine, for a page's own name may be made to stand for it (DNS rebinding).
+    """
+    try:
+        if local and not is_local(urlsplit(f"//{asked}").hostname):
+            return True
+        return origin is not None and urlsplit(origin).netloc != asked
+    except ValueError:
+        return True
+
+
+@contextlib.contextmanager
+def own_pages_only(local: bool) -> Iterator[None]:
+    """Servers of viser that are started within answer only their own pages, which viser does not see to.
+
+    Raises:
+        ImportError: viser has started none in the way that is known.
+    """
+    from websockets.asyncio import server as sockets
+
+    serve, guarded = sockets.serve, []
+
+    def guard(*where: Any, process_request: Any, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if is_foreign(request.headers.get("Origin"), request.headers.get("Host", ""), local):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "this viewer answers only its own pages\n")
+            return process_request(connection, request)
+
+        guarded.append(True)
+        return serve(*where, process_request=answer, **options)
+
+    sockets.serve = guard  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        sockets.serve = serve  # type: ignore[misc]
+    if not guarded:
+        raise ImportError('this viser would answer pages of other servers, too: pip install "viser==1.1.1"')
 
 
 def require_viser() -> Any:

@@ -19,6 +19,15 @@ def test_time_passes_at_the_chosen_speed() -> None:
     assert clock.tick(2.0) == 30
 
 
+def test_a_speed_that_there_is_not_changes_nothing() -> None:
+    """A client may send any text as the choice of a list; one that is no number would end the viewer for all."""
+    clock = Clock(300, 30.0)
+    clock.set_speed("0.25x")
+    for name in ("nanx", "-1x", "x", "1e300x", ""):
+        clock.set_speed(name)
+    assert clock.speed == 0.25 and clock.tick(2.0) == 15
+
+
 def test_a_slow_browser_skips_frames_instead_of_falling_behind() -> None:
     fast, slow = Clock(300, 30.0), Clock(300, 30.0)
     for _ in range(60):

@@ -1,0 +1,134 @@
+"""Whom the viewer's server answers, and what it lets clients do that are no browser of its own page."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnet.body import Body
+from magnet.export.page.takes import take
+from magnet.motion.scene import Scene
+from magnet.viewer.base import has_picture
+from magnet.viewer.saving import saved
+from magnet.viewer.server import is_foreign, is_local, own_pages_only
+
+HERE, EVERYWHERE = True, False
+
+
+@pytest.mark.parametrize(
+    ("origin", "asked", "local", "foreign"),
+    [
+        ("http://localhost:8080", "localhost:8080", HERE, False),
+        ("http://127.0.0.1:8080", "127.0.0.1:8080", HERE, False),
+        ("http://[::1]:8080", "[::1]:8080", HERE, False),
+        ("http://localhost:9000", "localhost:9000", HERE, False),  # through ssh -L 9000:localhost:8080
+        (None, "localhost:8080", HERE, False),  # no browser, or the page itself
+        ("https://evil.example", "localhost:8080", HERE, True),
+        ("http://localhost:3000", "localhost:8080", HERE, True),
+        ("http://localhost.evil.example:8080", "localhost:8080", HERE, True),
+        ("null", "localhost:8080", HERE, True),
+        ("http://evil.example:8080", "evil.example:8080", HERE, True),  # whose name stands for 127.0.0.1 by now
+        (None, "evil.example:8080", HERE, True),
+        (None, "", HERE, True),
+        (None, "[::1", HERE, True),
+        ("http://studio.local:8080", "studio.local:8080", EVERYWHERE, False),
+        ("https://evil.example", "studio.local:8080", EVERYWHERE, True),
+        ("http://[", "studio.local:8080", EVERYWHERE, True),
+    ],
+)
+def test_pages_of_other_servers_are_known(origin: str | None, asked: str, local: bool, foreign: bool) -> None:
+    assert is_foreign(origin, asked, local) == foreign
+
+
+def test_hosts_that_nobody_else_reaches_are_known() -> None:
+    assert all(map(is_local, ("localhost", "127.0.0.1", "127.1.2.3", "::1")))
+    assert not any(map(is_local, ("0.0.0.0", "::", "192.168.0.2", "studio.local", "", None)))
+
+
+def test_a_page_of_another_server_is_neither_told_nor_heard(server: Any) -> None:
+    """A browser connects to any address that a page names, and tells which page that is."""
+    viser = pytest.importorskip("viser")
+    from websockets.asyncio.client import connect
+    from websockets.exceptions import InvalidStatus
+    from websockets.typing import Origin, Subprotocol
+
+    port = server.get_port()
+
+    async def told(origin: str | None) -> int:
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        asked = None if origin is None else Origin(origin)
+        async with connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], origin=asked, max_size=None) as socket:
+            return len(await asyncio.wait_for(socket.recv(), 20))
+
+    for origin in (None, f"http://127.0.0.1:{port}"):
+        assert asyncio.run(told(origin)) > 0
+    for origin in ("https://evil.example", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            asyncio.run(told(origin))
+    for host, status in ((f"localhost:{port}", 200), (f"evil.example:{port}", 403)):
+        page = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        page.request("GET", "/", headers={"Host": host})
+        assert page.getresponse().status == status
+        page.close()
+
+
+def test_a_viser_that_starts_otherwise_is_refused_and_not_left_open() -> None:
+    pytest.importorskip("viser")
+    with pytest.raises(ImportError, match="answer pages of other servers"), own_pages_only(HERE):
+        pass
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where temporary folders are."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    yield tmp_path
+
+
+@pytest.mark.parametrize("kind", ["npz/../../../evil.npz", "/../../../evil.csv", "usd", ""])
+def test_a_format_that_there_is_not_writes_no_file(kind: str, folder: Path, duet: Scene, body: Body) -> None:
+    """viser passes on any text as the choice of a list, and this one names a file."""
+    with pytest.raises(ValueError, match="expected npz, bvh, glb, "):
+        saved(take("dance", duet), body, kind)
+    assert [each.name for each in folder.rglob("*")] == ["temporary"]
+
+
+@pytest.mark.parametrize(
+    ("told", "seen"),
+    [
+        ({}, True),
+        ({"image_height": 0}, False),  # a folded frame
+        ({"aspect": 0.0}, False),
+        ({"fov": 0.0}, False),
+        ({"fov": float("nan")}, False),
+        ({"position": np.full(3, np.nan)}, False),
+        ({"look_at": np.array([0.0, np.inf, 0.0])}, False),
+    ],
+)
+def test_the_camera_of_a_browser_without_a_picture_is_left_alone(
+    told: dict[str, Any], seen: bool, duet: Scene, body: Body, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else one such browser would end the viewer for all."""
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    usual = {"position": np.array([0.0, 1.0, 4.0]), "look_at": np.array([0.0, 0.85, 0.0]), "fov": 0.8, "aspect": 1.5}
+    camera = SimpleNamespace(**{**usual, "image_height": 600, **told})
+    assert has_picture(camera) == seen
+    viewer = Viewer([take("dance", duet)], body, port=0)
+    client = SimpleNamespace(client_id=7, camera=camera, atomic=viewer.server.atomic)
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: client})
+    try:
+        viewer.clock.seek(10)
+        viewer.draw()
+    finally:
+        viewer.stop()
+    assert viewer.shown == 10 and (7 in viewer.placed) == seen
