@@ -75,7 +75,7 @@ def pack(message: Message) -> list[bytes]:
         "betas": list(message.betas), "model": message.model, "heard": list(message.heard),
     }  # fmt: skip
     token = b"" if message.token is None else message.token.astype("<f4").tobytes()
-    text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
     return sealed([f"magnet/{message.sender}".encode(), text, message.poses.astype("<f4").tobytes(), token])
 
 

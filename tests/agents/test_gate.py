@@ -37,6 +37,12 @@ def test_a_message_comes_back_as_it_was():
         assert gate().take(pack(sent), 0.0) is not None
 
 
+def test_the_longest_names_of_any_script_fit_into_a_hello():
+    names = tuple(letter * 64 for letter in "A\u9f8d\u0939\U0001f916")
+    hello = Message("hello", names[3], names[3], 2**62, -1, 1.5e9, heard=names[:3])
+    assert Gate(names, names[0], "", 0).take(pack(hello), 0.0) is not None
+
+
 def changed(**fields) -> list[bytes]:
     """A message with other values in its header, and the checksum of those."""
     parts = pack(message())
