@@ -116,7 +116,8 @@ def announce(port: int, host: str, quiet: bool) -> None:
     """Say where the viewer is, and open the browser if there is one."""
     from magnet.viewer.server import open_browser
 
-    url = f"http://{'localhost' if host in ('0.0.0.0', '127.0.0.1', '::') else host}:{port}"
+    named = "localhost" if host in ("0.0.0.0", "127.0.0.1", "::") else host
+    url = f"http://{f'[{named}]' if ':' in named else named}:{port}"
     print(f"magnet view: {url}   (Ctrl+C ends it)", flush=True)
     if not quiet and not open_browser(url):
         tunnel = f"ssh -L {port}:localhost:{port}"

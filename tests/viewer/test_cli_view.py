@@ -140,6 +140,12 @@ def test_without_a_screen_it_says_how_to_get_there_by_ssh(monkeypatch, capsys) -
     assert "ssh -L 8099:localhost:8099" in out
 
 
+def test_the_address_that_is_said_can_be_opened_for_ipv6_too(capsys) -> None:
+    for host, said in (("::1", "http://[::1]:8099 "), ("::", "http://localhost:8099 ")):
+        view.announce(8099, host, quiet=True)
+        assert said in capsys.readouterr().out
+
+
 def test_without_a_display_no_browser_is_started(monkeypatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
