@@ -16,8 +16,8 @@ from torch import Tensor
 from magnet.body.base import Body
 
 from magnet.body.joints import (  # isort: skip
-    COLLARS, FEET, HIPS, JOINT_NAMES, L_HIP, L_SHOULDER, NECK, PARENTS, PELVIS, R_HIP, R_SHOULDER, SHOULDERS, SPINE1,
-    SPINE2, SPINE3,
+    COLLARS, FEET, HIPS, JOINT_NAMES, L_HIP, L_SHOULDER, NECK, PARENTS, PELVIS, R_HIP, R_SHOULDER, SHOULDERS, SPINE,
+    SPINE1, SPINE2, SPINE3,
 )  # fmt: skip
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_6d, to_6d
@@ -353,11 +353,14 @@ def start(
         guess = world[:, :, PARENTS[j]] if guess is None else guess
         world[:, :, j] = guess if hints is None else torch.where(known[:, :, j, None, None], hints[:, :, j], guess)
         child = [c for c in range(BODY_JOINTS) if PARENTS[c] == j]
-        if j not in TORSO[:6] and len(child) == 1 and child[0] in place and j in place:
+        if j not in SPINE and len(child) == 1 and child[0] in place and j in place:
             bone = (world[:, :, j] @ (rest[:, child[0]] - rest[:, j])[..., None])[..., 0]
             want = targets[:, :, place[child[0]]] - targets[:, :, place[j]]
-            both = (sure[:, :, place[j]] & sure[:, :, place[child[0]]])[..., None, None]
-            world[:, :, j] = torch.where(both, swing(bone, want) @ world[:, :, j], world[:, :, j])
+            swings = sure[:, :, place[j]] & sure[:, :, place[child[0]]]
+            if j in HIPS:  # hips lie elsewhere in other bodies, so a known thigh tells more than the way to the knee
+                swings = swings & ~known[:, :, j]
+            swung = swing(bone, want) @ world[:, :, j]
+            world[:, :, j] = torch.where(swings[..., None, None], swung, world[:, :, j])
     local = world.clone()
     local[:, :, 1:] = world[:, :, list(PARENTS[1:])].transpose(-1, -2) @ world[:, :, 1:]
     hips = [place[j] for j in HIPS]

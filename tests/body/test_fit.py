@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from magnet.body import JOINT_NAMES, PARENTS, Body, load_body
-from magnet.body.fit import FitSettings, clearance, fit_body, jumps_in, kabsch, shape_from_lengths, swing
+from magnet.body.fit import FitSettings, clearance, fit_body, jumps_in, kabsch, shape_from_lengths, start, swing
+from magnet.body.joints import HIPS, KNEES
 from magnet.datamodules.preparing.fit_cache import LIMBS, fit_whole
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import measured
+from magnet.motion.frames import rigid
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -77,6 +79,25 @@ def test_targets_of_the_body_itself_are_met_within_a_centimetre(
     torch.testing.assert_close(fit.residual, (found - targets).norm(dim=-1))
     assert fit.residual.mean() < 0.01
     assert fit.scene.body == body.id
+
+
+def test_a_fit_to_joints_alone_starts_with_thighs_that_lead_to_the_knees(body: Body, moving: Scene) -> None:
+    targets, rest = body.joints(moving)[0], body.rest_joints(moving.betas[0])
+    sure = torch.ones(targets.shape[:3], dtype=torch.bool)
+    local, place, _ = start(targets, ALL, rest, None, sure)
+    found = body.bone_chain(local[:, :, 1:], rigid(local[:, :, 0], place), rest)[1]
+    bones = [each[:, :, KNEES] - each[:, :, HIPS] for each in (found, targets)]
+    torch.testing.assert_close(*bones, atol=1e-4, rtol=0)
+
+
+def test_a_known_thigh_starts_as_it_is_known(body: Body, moving: Scene) -> None:
+    targets = body.joints(moving)[0]
+    hints = torch.full((*targets.shape[:3], 3, 3), torch.nan)
+    hints[:, :, HIPS] = torch.eye(3)
+    sure = torch.ones(targets.shape[:3], dtype=torch.bool)
+    local = start(targets, ALL, body.rest_joints(moving.betas[0]), hints, sure)[0]
+    thigh = local[:, :, :1] @ local[:, :, HIPS]
+    torch.testing.assert_close(thigh, torch.eye(3).expand_as(thigh), atol=1e-5, rtol=0)
 
 
 def test_known_rotations_come_back(body: Body, moving: Scene) -> None:
