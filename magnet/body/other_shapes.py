@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from magnet.body.base import Body
@@ -27,7 +28,7 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
 
     Args:
         scene: (B, T, P).
-        betas: (B, P, 10) shapes to have; of absent people they mean nothing.
+        betas: (B, P, 10) shapes to have; those of free slots are not read.
         body: the body that both shapes belong to.
 
     Raises:
@@ -38,7 +39,7 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
     floor = off_floor(lowest(scene, body), counting(scene))
     if floor.any():
         return _raised(with_shapes(_raised(scene, -floor), betas, body), floor)
-    betas = betas.to(scene.betas)
+    betas = torch.where(scene.present[..., None], betas.to(scene.betas), scene.betas)
     people = scene.betas.shape[:2]
     soles, other_soles = (clearance(body, each.flatten(0, 1)).unflatten(0, people) for each in (scene.betas, betas))
     before, after = body.joints(scene), body.joints(scene.replace(betas=betas))
@@ -54,7 +55,7 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
         foot = FEET.index(ANKLES[side])
         place[..., 1] += (other_soles - soles)[:, None, :, foot]
         body_rot = reach(body, body_rot, T_world_root, shapes, limb, place)
-    changed = scene.replace(betas=betas, body_rot=body_rot, T_world_root=T_world_root)
+    changed = scene.replace(betas=betas).with_poses(scene.present[:, None], body_rot, T_world_root)
     recorded = Wishes.of(scene, body, "firm")
     wishes = replace(Wishes.of(changed, body, "firm"), held=recorded.held, between=recorded.between)
     return corrected(changed, correction(changed, body, wishes, settle=Settle(tilt=UPRIGHT)))

@@ -82,6 +82,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     lend = [] if options.shapes in (None, ["exchange"]) else options.shapes
     how_read, how_lent = shared(scene_files.reading(options), options.inputs, lend or options.inputs)
     got = scene_files.read_inputs(options, how_read)
+    got = replace(got, scene=got.scene.to_float32())  # as corrections are computed; NumPy's arrays are float64
     read = [*options.inputs, *(options.shapes or ())]
     scene_files.require_unread(out, read, scene_files.slots_of(got.scene))
     formats.require_finite(got.scene, "cut such frames out")

@@ -56,6 +56,15 @@ def test_with_their_own_shapes_people_move_as_before(handshake: Scene) -> None:
     assert float(off.mean()) < 0.02
 
 
+def test_a_free_slot_stays_free(handshake: Scene) -> None:
+    padded = handshake.pad_agents(3)
+    made = with_shapes(padded, torch.ones_like(padded.betas), BODY)
+    others = made.permute_agents(torch.tensor([2]))
+    for name, value in padded.permute_agents(torch.tensor([2])).tensors().items():
+        assert torch.equal(getattr(others, name), value), name
+    assert not torch.equal(made.betas[:, :2], padded.betas[:, :2])
+
+
 def test_who_stands_far_from_the_floor_stays_there(handshake: Scene, changed: Scene) -> None:
     T_world_root = handshake.T_world_root.clone()
     T_world_root[..., 1, 3] += 3.0

@@ -85,6 +85,18 @@ def test_poses_are_corrected_too_unless_they_are_to_be_kept(crowded: Scene, tmp_
     assert not torch.equal(Scene.load(out).body_rot, crowded.body_rot)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_scenes_of_other_float_types_are_refined_in_float32(crowded: Scene, tmp_path: Path, dtype: torch.dtype) -> None:
+    short = crowded.slice(0, 24)
+    floats = {name: value.to(dtype) for name, value in short.tensors().items() if value.is_floating_point()}
+    scene, out = short.replace(**floats), tmp_path / "apart.npz"
+    same = scene.to_float32().save(tmp_path / "float32.npz"), tmp_path / "same.npz"
+    assert cli.main(["refine", str(scene.save(tmp_path / "crowded.npz")), str(out)]) == 0
+    assert cli.main(["refine", *map(str, same)]) == 0
+    for name, value in Scene.load(same[1]).tensors().items():
+        assert torch.equal(getattr(Scene.load(out), name), value), name
+
+
 def test_skeleton_files_of_several_people_are_refined_as_well(crowded: Scene, tmp_path: Path, capsys) -> None:
     scene = crowded.save(tmp_path / "crowded.npz")
     assert cli.main(["export", str(scene), str(tmp_path / "two.bvh")]) == 0
