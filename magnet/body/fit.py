@@ -50,8 +50,8 @@ class FitSettings:
     shape_steps: int = 160
     shape_frames: int = 96  # evenly spaced frames that refine the shape
     learning_rate: float = 0.03
-    hint: float = 6.0  # of the squared chordal distance to a joint's known rotation
-    rest: float = 0.5  # the same to the closed-form start, for joints without a known rotation
+    hint: float = 6.0  # of the squared chordal distance to the start, of joints whose rotation is known
+    rest: float = 0.5  # the same of the other joints
     smooth: float = 20.0  # of squared second differences of rotations (at 30 fps)
     shape: float = 2.0  # of a squared shape number, in the refinement of shapes
     floor: float = 2.0  # of a squared centimetre of a sole under the floor

@@ -97,8 +97,8 @@ def repaired(
     if not scene.T_world_root.numel():
         return scene
     if scene.valid is not None and not bool(scene.valid.all()):
-        each = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
-        return _by_stretches(scene, fixed, begun, each)
+        repair = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
+        return _by_stretches(scene, fixed, begun, repair)
     every = max(round(scene.fps / FPS), 1)
     if drifting:
         scene = undrifted(unjumped(grounded(scene, body, fixed), body, fixed), body, fixed, slides)
@@ -158,8 +158,8 @@ def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
     return scene.with_poses(far[:, None], scene.body_rot, root)
 
 
-def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, each: Callable[..., Scene]) -> Scene:
-    """`each` of every stretch of valid frames; those that are not valid come back as they are."""
+def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, repair: Callable[..., Scene]) -> Scene:
+    """Every stretch of valid frames repaired by itself; frames that are not valid come back as they are."""
     assert scene.valid is not None
     made = []
     for b, valid in enumerate(scene.valid.cpu()):
@@ -169,7 +169,7 @@ def _by_stretches(scene: Scene, fixed: Tensor | None, begun: bool, each: Callabl
             piece = scene.select([b]).slice(begin, begin + count).replace(valid=None)
             if run:
                 kept = fixed_in(still, slice(begin, begin + count))
-                piece = each(piece, fixed=kept, begun=begun and not begin)
+                piece = repair(piece, fixed=kept, begun=begun and not begin)
             pieces.append(piece)
             begin += count
         made.append(cat_time(pieces))

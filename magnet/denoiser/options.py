@@ -126,7 +126,7 @@ class DenoiserLoss:
         consistency_warmup: training steps over which lambda_3 grows from 0.
         near: error of pairwise transforms in which centimetres near a partner count (ours).
         shake: error of how deltas change from frame to frame (ours).
-        unfused: weight of the same three terms on the network's own deltas and pairwise transforms, where
+        unfused: weight of the terms delta, pairwise and near on the network's own deltas and pairwise transforms, where
             `network.pairwise_posterior` replaces them (ours).
         joint: distance of the decoded joints, in metres (ours); see `magnet.denoiser.body_losses`.
         velocity: error of the decoded joints' velocities, in m/s (ours).

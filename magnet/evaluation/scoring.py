@@ -52,7 +52,7 @@ def aligned(scene: Scene, frame: int) -> Scene:
 
 
 def shared_world(scene: Scene, frame: int) -> Tensor:
-    """T_shared_world, with the origin between the people and facing as agent 0 does. -> (B, 1, 1, 4, 4)
+    """T_shared_world, with the origin between the people and facing as the first of them does. -> (B, 1, 1, 4, 4)
 
     Both are taken at one frame, the last recorded one, so that positions of different scenes can be compared.
     """
@@ -78,7 +78,7 @@ WINDOW_STRIDE = 5
 """Frames between the training windows that the regression is fitted to and the nearest one is looked for among."""
 
 MAX_WINDOWS = 1500
-"""At most about so many of them, mirror images not counted; with more data their stride is larger."""
+"""About so many of them, mirror images not counted; with more data their stride grows, to `baseline_stride` at most."""
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""

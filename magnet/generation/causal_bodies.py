@@ -199,11 +199,12 @@ def decode_bodies(
         later, ways = continuation(world, latent, deltas, expected)
         latent, deltas = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
     frames = slice(first * TOKEN_FRAMES - lead, (stop + more) * TOKEN_FRAMES)
-    shown = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
+    wanted = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
     keep = world.rows_by_frame(world.known[first:stop] & options.keep_given)
     there = world.there[~keep[:, world.there].all(dim=0)]  # of whom something is seen that is not given
-    features = decoded_frames(world, latent, deltas, shown, low, near - low, there)
-    keep, T_world_can = pad(keep, (0, 0, 0, more * TOKEN_FRAMES)), shown_path(world, near, ways, stop + more)[:, frames]
+    features = decoded_frames(world, latent, deltas, wanted, low, near - low, there)
+    keep = pad(keep, (0, 0, 0, more * TOKEN_FRAMES))
+    T_world_can = path_with_expected(world, near, ways, stop + more)[:, frames]
     given = world.given.frames_at(torch.arange(frames.start, frames.stop).clamp(max=world.given.frames - 1))
     if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
         given = cat_time([world.uncorrected, given.slice(lead)])
@@ -217,7 +218,7 @@ def decode_bodies(
     return freeze_after(made, there, before)
 
 
-def shown_path(world: World, near: int, ways: Tensor | None, stop: int) -> Tensor:
+def path_with_expected(world: World, near: int, ways: Tensor | None, stop: int) -> Tensor:
     """Canonical frames before row `near`, or `stop` if that is later, as they are shown. -> (B, 4 n, P, 4, 4)
 
     The last of them is averaged with where the first of `ways` (B, n, P, 4, 9) leads: what is expected next.

@@ -21,7 +21,7 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
     """
     options, known, model = world.options, world.known, world.model
     blend = -(-options.blend // TOKEN_FRAMES) if options.keep_given else 0
-    # Only what is given later has a seam before it; the plain network rounds otherwise in another window.
+    # Later rows count only where something given there has a seam; `reference`, which rounds by its window, reads all.
     later = options.precision == "reference" or bool(known[stop : stop + blend].any())
     low, high = max(first - blend, 0), min(stop + blend * later, len(known))
     behind, ahead = receptive_field(model)

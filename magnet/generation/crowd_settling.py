@@ -10,8 +10,9 @@ from torch import Tensor
 
 from magnet.body.apart import APART, ARM_REACH, excess_depth, near_pairs
 from magnet.body.repair import repaired
+from magnet.body.settle import LEAD
 from magnet.generation.separation import open_body_on
-from magnet.generation.settling import FINISHED, LEAD, Corrected, settled_chunk
+from magnet.generation.settling import FINISHED, Corrected, settled_chunk
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, concatenate
 

@@ -33,23 +33,24 @@ def starts(
         T_prev_can: (B, T, P, 4, 4) deltas.
         T_self_partner: (B, T, P, K, 4, 4) pairwise transforms; None: not predicted.
     """
-    starts = T_world_before.clone()
+    T_world_start = T_world_before.clone()
     if bool((there | ~present).all()):
-        return starts
+        return T_world_start
     anchor = (present * (4 * now.int() + 2 * there.int() + new.int())).argmax(dim=1)
-    scene = torch.arange(len(starts), device=starts.device)
-    onward = starts[scene, anchor] @ T_prev_can[scene, 0, anchor]
-    onward = torch.where(there[anchor, None, None], onward, torch.eye(4, dtype=starts.dtype, device=starts.device))
+    scene = torch.arange(len(present), device=present.device)
+    onward = T_world_start[scene, anchor] @ T_prev_can[scene, 0, anchor]
+    onward = torch.where(there[anchor, None, None], onward, torch.eye(4, dtype=onward.dtype, device=onward.device))
     T_world_anchor = torch.where(now[anchor, None, None], T_world_first[scene, anchor], onward)
     for agent in (~there).nonzero()[:, 0].tolist():
         stands = T_world_first[:, agent] if bool(now[agent]) else T_world_anchor
-        starts[:, agent] = stands @ inverse(T_prev_can[:, 0, agent])
+        T_world_start[:, agent] = stands @ inverse(T_prev_can[:, 0, agent])
     if T_self_partner is None:
-        return starts
-    ways = place(T_prev_can, None, starts)
+        return T_world_start
+    ways = place(T_prev_can, None, T_world_start)
     for agent in (~there & ~now).nonzero()[:, 0].tolist():
         slot = (agent - (agent > anchor).int()).clamp(max=T_self_partner.shape[3] - 1)
         hung = ways[scene, :, anchor] @ project_se2(T_self_partner[scene, :, anchor, slot])
         shift = align_planar(ways[:, :, agent], hung)
-        starts[:, agent] = torch.where((anchor == agent)[:, None, None], starts[:, agent], shift @ starts[:, agent])
-    return starts
+        own = T_world_start[:, agent]
+        T_world_start[:, agent] = torch.where((anchor == agent)[:, None, None], own, shift @ own)
+    return T_world_start

@@ -36,7 +36,10 @@ BEGIN_BEHIND = "begin from what lies behind the jump, past.slice({})"
 
 
 def places(scene: Scene) -> NDArray[np.float32]:
-    """Where people are, in NumPy, where so little costs less; a copy, for frames may be written over. (B, T, P, 3) m"""
+    """Pelvis positions, metres. -> (B, T, P, 3), a copy, because the caller may write over the frames
+
+    In NumPy, whose operators cost less than torch's on so few numbers.
+    """
     return scene.T_world_root.cpu().float().numpy()[..., :3, 3].copy()
 
 

@@ -231,8 +231,8 @@ class Rollout:
             yield self.length if final >= self.length else final - self._margins[1]
             return
         for end in (min(self.reached, final), final):
-            while (shown := self.first + self.world.finalized) < end:
-                yield self._finalize(min(shown + CHUNK, end), end)
+            while (done := self.first + self.world.finalized) < end:
+                yield self._finalize(min(done + CHUNK, end), end)
 
     @torch.no_grad()
     def _finalize(self, stop: int, end: int) -> int:

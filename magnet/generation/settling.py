@@ -20,7 +20,7 @@ from magnet.motion.frames import posed
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 
-LEAD = 2
+LEAD_TOKENS = 2
 """Token steps of the past that a block is corrected with; they stay."""
 
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
@@ -192,10 +192,9 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
         return scene, Corrected(scene.T_world_root.new_zeros(scene.scenes, 2, 0, DOFS), None, who)
     past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
-    offset, parted = (None, None) if past is None else past[:2]
+    before, parted = (None, None) if past is None else past[:2]
     holding = None if parted is None else parted == 0
     still = fixed[..., there.to(fixed.device)]
-    before = offset
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
     for looser in LOOSELY:

@@ -13,7 +13,7 @@ from magnet.generation.chunk_bodies import chunk_bodies
 from magnet.generation.couples import LONG, Couples
 from magnet.generation.places import Places
 from magnet.generation.separation import Decode, separated
-from magnet.generation.settling import LEAD, Corrected, settled_block
+from magnet.generation.settling import LEAD_TOKENS, Corrected, settled_block
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
@@ -164,7 +164,7 @@ class WorldState(Places):
     ) -> Tensor:
         """Correct the poses of the newly placed, and make them what the model goes on from. -> latents (B, n, P, C)"""
         assert self.settle is not None
-        lead = min(LEAD, first)
+        lead = min(LEAD_TOKENS, first)
         latent, new, known = self._with_lead(lead, tokens, latent, finished, first, stop)
         low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
         T_world_can, unseen = self.T_world_can[:, frames], self._unseen(first).to(latent.device)

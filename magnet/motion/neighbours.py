@@ -12,7 +12,7 @@ from magnet.motion.frames import partners
 from magnet.motion.tokens import TokenLayout
 
 ENTER, LEAVE = 1.5, 2.2
-"""Metres over the ground: who comes nearer than the first becomes a partner, who is further than the second stops being
+"""Metres over the ground: who comes nearer than the first becomes a partner, who goes beyond the second stops being
 one. With 2.5 and 3.5 strangers crowd together, because the model learned from couples (docs/crowds.md)."""
 
 

@@ -90,8 +90,8 @@ class SamplerOptions:
             best sampled, or 1.
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
-            beyond which a partner is one no longer; further off, with 2.5 and 3.5 m, strangers crowd together, for the
-            models learned from couples (docs/crowds.md).
+            beyond which a partner stops being one. With 2.5 and 3.5 m strangers crowd together, because the models
+            learned from couples (docs/crowds.md).
         crowd_spacing: metres between the couples with which a crowd from nothing begins.
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.

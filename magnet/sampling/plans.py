@@ -71,9 +71,10 @@ def changing(levels: Tensor) -> Tensor:
 def opened(levels: Tensor, count: int) -> Tensor:
     """A stage's levels with an opening: `count` more steps at high noise, where nothing of its window is known.
 
-    What people do and how far apart they are is told by hundreds of noisy numbers together, so it is decided while each
-    of them seems to be noise alone: above the first level of a few steps, and a single step there ends in the mean of
-    all that could be. With a past, it is decided. (S + 1, W, P) -> (at most S + 1 + count, W, P)
+    Hundreds of noisy numbers tell together what people do and how far apart they are. So that is decided at levels at
+    which each number by itself looks like pure noise, higher than the first that a plan of few steps reaches; a single
+    step there from pure noise ends in the mean of all that could be. Where a past is known, it has decided already.
+    (S + 1, W, P) -> (at most S + 1 + count, W, P)
     """
     if not count or bool((levels[0] < LEVELS).any()):
         return levels

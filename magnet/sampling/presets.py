@@ -8,11 +8,11 @@ from typing import Any
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    # The default before: it loses a quarter of the variance, and with it much of what the shipped model gets wrong.
+    # The default before. It loses a quarter of the variance, and with that much of what the shipped model gets wrong.
     "steady": {"steps": 30, "eta": 1.0, "shift": 3.0, "solver": "ddim", "spacing": "even", "opening": 0},
     # What the model makes, and nothing corrected after it.
     "plain": {"settle": "off", "smooth_path": False, "together": 0.0},
-    # Without rolling, for any model.
+    # Strides and no pyramid, for any model.
     "strides": {"stride": 12, "pyramid_offset": 0},
     "paper": {
         "steps": 30,  # A.3

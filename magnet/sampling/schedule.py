@@ -306,8 +306,8 @@ class MaskSchedule:
         starts = [*delay.unique().tolist(), grid.steps + int(delay.max())]
         level, stages = initial_levels(known), []
         for first, last in blocks(target, block):
-            ahead = min(max(grid.stride - 1, AHEAD), (grid.window - last + first) // 2)
-            start = max(0, last + ahead - grid.window)
+            unknown = min(max(grid.stride - 1, AHEAD), (grid.window - last + first) // 2)
+            start = max(0, last + unknown - grid.window)
             given = known[last : start + grid.window].any(dim=1).nonzero()[:, 0]
             stop = last + int(given[-1]) + 1 if lookahead and len(given) else last
             now = slice(first - start, last - start)

@@ -19,8 +19,8 @@ def chosen(grid: Grid, target: tuple[int, ...], name: str = "target", has: str =
     Args:
         grid: what they are part of.
         target: their slots.
-        name: what these are called where they are given, for messages.
-        has: of whom there are so many, for messages.
+        name: of the argument that gives them, for messages.
+        has: words before the range of slots, for messages.
 
     Raises:
         ValueError: no such agent, one named twice, or nobody is left to be given.
