@@ -143,17 +143,17 @@ class Overlap(NamedTuple):
         return f"{limbs}, {when}, {100 * self.depth:.1f} cm"
 
 
-def overlaps(scene: Scene, body: Body, over: float = TOUCH) -> list[Overlap]:
-    """Limbs that are deeper in each other than `over` metres, the deepest first; forearm on forearm apart.
+def overlaps(scene: Scene, body: Body) -> list[Overlap]:
+    """Limbs that are deeper in each other than `TOUCH`, the deepest first; forearm on forearm apart.
 
     A frame that is not valid is none.
     """
     joints, (b, t, one, other) = _near(scene, body)
     if scene.valid is not None:
         b, t, one, other = (each[scene.valid.to(b.device)[b, t]] for each in (b, t, one, other))
-    depth = penetration_depth(joints[b, t, one], joints[b, t, other], touch=over)
+    depth = penetration_depth(joints[b, t, one], joints[b, t, other])
     place: dict[tuple[int, int, int, int, int], dict[int, float]] = {}
-    for n, i, k in (depth > over).nonzero().tolist():
+    for n, i, k in (depth > TOUCH).nonzero().tolist():
         who = int(b[n]), int(one[n]), i, int(other[n]), k
         place.setdefault(who, {})[int(t[n])] = float(depth[n, i, k])
     found = []

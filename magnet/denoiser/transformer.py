@@ -21,9 +21,13 @@ FEW_SLOTS = 8
 """Most agent slots that a GPU runs at once, whoever is in them; with more, the empty ones cost too much."""
 
 
-def sinusoids(values: Tensor, width: int, longest: float = 10_000.0) -> Tensor:
+LONGEST = 10_000.0
+"""Over 2 pi, the longest wave of level embeddings and of rotations by time."""
+
+
+def sinusoids(values: Tensor, width: int) -> Tensor:
     """Sines and cosines of geometrically spaced frequencies. (...) -> (..., width)"""
-    frequency = torch.exp(torch.arange(width // 2, device=values.device) * (-math.log(longest) / (width // 2)))
+    frequency = torch.exp(torch.arange(width // 2, device=values.device) * (-math.log(LONGEST) / (width // 2)))
     angle = values[..., None].float() * frequency
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
@@ -36,10 +40,10 @@ def rotate(x: Tensor, time: Tensor) -> Tensor:
     return rotated(x, *rotation(time, x.shape[-1]))
 
 
-def rotation(time: Tensor, width: int, base: float = 10_000.0) -> tuple[Tensor, Tensor]:
+def rotation(time: Tensor, width: int) -> tuple[Tensor, Tensor]:
     """Cosines and sines by which `rotated` turns vectors of `width` numbers. time (L,) -> (L, width / 2) each"""
     half = width // 2
-    frequency = base ** (-torch.arange(half, device=time.device, dtype=torch.float32) / half)
+    frequency = LONGEST ** (-torch.arange(half, device=time.device, dtype=torch.float32) / half)
     angle = time[:, None].float() * frequency
     return angle.cos(), angle.sin()
 

@@ -233,7 +233,7 @@ def gone_on(before: Tensor, path: Tensor, blend: int = GOES_ON) -> Tensor:
     return from_planar(yaw[:, known + 1 :] + off[..., 0], ground[:, known + 1 :] + off[..., 1:]).to(path)
 
 
-def eased_in(T_world_before: Tensor, T_prev_can: Tensor, who: Tensor, frames: int = EASES_IN) -> Tensor:
+def eased_in(T_world_before: Tensor, T_prev_can: Tensor, who: Tensor) -> Tensor:
     """Steps of which the first begin as fast as the last one before; what that takes of the way is not made up for.
 
     A token made live is drawn for itself, and who goes on in it would change speed at its border at once.
@@ -241,8 +241,7 @@ def eased_in(T_world_before: Tensor, T_prev_can: Tensor, who: Tensor, frames: in
     Args:
         T_world_before: (B, 2, P, 4, 4) canonical frames of the last two frames before.
         T_prev_can: (B, T, P, 4, 4) each frame as seen from the one before it; planar.
-        who: (P,) bool, whose steps are eased.
-        frames: in so many the speed becomes that of the steps.
+        who: (P,) bool, whose steps are eased, over `EASES_IN` frames.
 
     Returns:
         (B, T, P, 4, 4).
@@ -250,7 +249,7 @@ def eased_in(T_world_before: Tensor, T_prev_can: Tensor, who: Tensor, frames: in
     T_prev_last = inverse(T_world_before[:, :1]) @ T_world_before[:, 1:]
     yaw, ground = to_planar(torch.cat([T_prev_last, T_prev_can], dim=1))
     since = torch.arange(1, T_prev_can.shape[1] + 1, device=yaw.device, dtype=yaw.dtype)[:, None]
-    share = torch.where(who, (1 - since / frames).clamp_min(0), 0.0)  # (T, P)
+    share = torch.where(who, (1 - since / EASES_IN).clamp_min(0), 0.0)  # (T, P)
     yaw, off = yaw[:, 1:] + share * (yaw[:, :1] - yaw[:, 1:2]), ground[:, :1] - ground[:, 1:2]
     eased = from_planar(yaw, ground[:, 1:] + share[..., None] * off).to(T_prev_can)
     return torch.where((share > 0)[..., None, None], eased, T_prev_can)

@@ -32,6 +32,9 @@ STEP = {"light": 0.5, "firm": 1.0}
 RAMP = 8
 """Frames over which a place's move grows."""
 
+AVERAGED = 4
+"""Frames before and after that a place's move is averaged over."""
+
 BENT = 0.1
 """Of a latent's length: what a step changes of it at most."""
 
@@ -217,10 +220,10 @@ class BodyGuidance:
         return bend * (most / torch.maximum(length, most).clamp_min(1e-8)), shift
 
 
-def smoothed(shift: Tensor, frames: int = 4) -> Tensor:
-    """Averaged over so many frames before and after. (B, T, P, 2) -> same"""
-    flat = F.pad(shift.flatten(2).transpose(1, 2), (frames, frames), mode="replicate")
-    return F.avg_pool1d(flat, 2 * frames + 1, stride=1).transpose(1, 2).view(shift.shape)
+def smoothed(shift: Tensor) -> Tensor:
+    """Averaged over `AVERAGED` frames before and after. (B, T, P, 2) -> same"""
+    flat = F.pad(shift.flatten(2).transpose(1, 2), (AVERAGED, AVERAGED), mode="replicate")
+    return F.avg_pool1d(flat, 2 * AVERAGED + 1, stride=1).transpose(1, 2).view(shift.shape)
 
 
 def moved_along(

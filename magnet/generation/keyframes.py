@@ -75,7 +75,8 @@ def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held
         ValueError: no such agent or frame.
     """
     last = scene.frames - 1
-    frame, pose = frame // TOKEN_FRAMES * TOKEN_FRAMES, frame // TOKEN_FRAMES * TOKEN_FRAMES if pose is None else pose
+    frame = frame // TOKEN_FRAMES * TOKEN_FRAMES
+    pose = frame if pose is None else pose
     if not 0 <= agent < scene.agents:
         raise ValueError(f"person {agent + 1} is not there: the scene has {scene.agents}")
     if frame < 0 or not 0 <= pose <= last:

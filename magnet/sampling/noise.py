@@ -69,17 +69,30 @@ def ddim_step(
     >>> ddim_step(noisy, clean, now=torch.tensor([800]), after=torch.tensor([0]))  # at level 0: what was predicted
     tensor([2.])
     """
-    a_now, a_after = alpha_bar(now), alpha_bar(after)
-    # At level 0 there is no noise to extract; the clamp only guards a branch that `where` discards.
-    left = (1 - a_now).clamp_min(1e-12)
-    noise = (noisy - a_now.sqrt() * clean) / left.sqrt()
-    if eta and step_noise is not None:
-        renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
-        noise = (1 - a_after - renewed.square()).clamp_min(0).sqrt() * noise + renewed * step_noise
-    else:
-        noise = (1 - a_after).sqrt() * noise
-    moved = a_after.sqrt() * clean + noise
+    signal, left, old, new, signal_after = step_factors(now, after, eta)
+    rest = old * ((noisy - signal * clean) / left)
+    if eta:
+        assert step_noise is not None
+        rest = rest + new * step_noise
+    moved = signal_after * clean + rest
     return torch.where(now == after, noisy, torch.where(after == 0, clean, moved))
+
+
+def step_factors(now: Tensor, after: Tensor, eta: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The factors of a DDIM step, which depend on levels alone. (...) int each -> five of (...)
+
+    Square roots of the signal and of the noise at `now`; what old and new noise are multiplied by; the square root of
+    the signal at `after`. Arguments as for `ddim_step`.
+    """
+    a_now, a_after = alpha_bar(now), alpha_bar(after)
+    # At level 0 there is no noise to extract; whoever is there already stays, whatever comes of it.
+    left = (1 - a_now).clamp_min(1e-12)
+    new = torch.zeros_like(left)
+    old = (1 - a_after).sqrt()
+    if eta:
+        new = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
+        old = (1 - a_after - new.square()).clamp_min(0).sqrt()
+    return a_now.sqrt(), left.sqrt(), old, new, a_after.sqrt()
 
 
 def shifted(levels: Tensor, shift: float) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import DenoiseFn, Guidance
-from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, half_log_snr
+from magnet.sampling.noise import LEVELS, NoiseStream, half_log_snr, step_factors
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
 
@@ -53,8 +53,7 @@ class StagePlan:
         rows: which rows of the window.
         levels: (S, V, W, P) int before each step, as each view is shown them; V is 1 where nobody is hidden.
         views: where somebody is hidden.
-        numbers: (S, 6, rows, P, 1 + slots): share of the extrapolation; then the square roots of the signal and of the
-            noise before; factors of old and new noise; the square root of the signal after.
+        numbers: (S, 6, rows, P, 1 + slots): share of the extrapolation, then the five of `step_factors`.
         stays, ends: (S, rows, P, 1 + slots) bool, whose level stays, and who becomes clean.
         draws: for each step the (row, level) pairs that new noise is drawn for, and where several levels share a row.
         last: (rows, P, 1 + slots) int, levels at which each group was predicted last, -1 where it never was; on CPU.
@@ -191,7 +190,7 @@ def _plan(
         for now, after in pairwise(group):
             moves = now != after
             carry = carried_share(now, after, past) if before is not None else torch.zeros(now.shape)
-            numbers.append(torch.stack([carry, *step_numbers(now, after, eta)]))
+            numbers.append(torch.stack([carry, *step_factors(now, after, eta)]))
             draws.append(draws_of(now, moves, layout, device))
             past = torch.where(moves, now, past)
         stays, ends = group[:-1] == group[1:], group[1:] == 0
@@ -219,18 +218,6 @@ def carried_share(now: Tensor, after: Tensor, past: Tensor) -> Tensor:
     since = torch.where(past == LEVELS, length, half_log_snr(now) - half_log_snr(past.clamp_min(0)))
     share = (length / (2 * since)).clamp(max=1.0)
     return torch.where((now != after) & (after > 0) & (past >= 0), share, 0.0)
-
-
-def step_numbers(now: Tensor, after: Tensor, eta: float) -> tuple[Tensor, ...]:
-    """The factors of `magnet.sampling.noise.ddim_step`. (...) int each -> five of (...)"""
-    a_now, a_after = alpha_bar(now), alpha_bar(after)
-    left = (1 - a_now).clamp_min(1e-12)
-    renewed = torch.zeros_like(left)
-    old = (1 - a_after).sqrt()
-    if eta:
-        renewed = eta * ((1 - a_after) / left * (1 - a_now / a_after.clamp_min(1e-12)).clamp_min(0)).sqrt()
-        old = (1 - a_after - renewed.square()).clamp_min(0).sqrt()
-    return a_now.sqrt(), left.sqrt(), old, renewed, a_after.sqrt()
 
 
 def draws_of(
