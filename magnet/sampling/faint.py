@@ -33,7 +33,7 @@ def faint_levels(
         levels = lately if levels is None else torch.maximum(levels, lately)
     if guidance.stabilization_beside and not live:
         given = known[stage.start : stage.stop].all(dim=0)
-        beside = (given.sum() > given.long()) & ~known
+        beside = (given.sum() > given.long()) & ~known  # somebody else is given throughout
         highest = max(guidance.stabilization_beside, guidance.stabilization_level or 0)
         levels = torch.where(beside, highest, 0 if levels is None else levels)
     return levels

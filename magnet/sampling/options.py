@@ -17,8 +17,6 @@ from magnet.sampling.solvers import Solver
 
 Separation = Literal["off", "light", "firm"]
 Settling = Literal["off", "light", "firm", "hold"]
-
-
 NoiseSampling = Literal["joint", "independent"]
 Precision = Literal["reference", "float32", "bf16", "int8"]
 Spacing = Literal["even", "log_snr"]
@@ -60,8 +58,8 @@ class SamplerOptions:
             there are levels above the first step's. None: as the model is best sampled, or 0.
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
-        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on take 3: deltas are far more
-            certain than pairwise transforms, so a little is enough (docs/experiments_sampling.md).
+        pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on the validation take: deltas
+            are far more certain than pairwise transforms, so a little is enough (docs/experiments_sampling.md).
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
@@ -82,7 +80,7 @@ class SamplerOptions:
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
         keep_given: restore the given frames instead of their lossy reconstruction, and blend the seams.
-        blend: frames over which a seam is blended, after given frames and before them; 20 were chosen on take 3.
+        blend: frames over which a seam is blended, after given frames and before them; chosen on the validation take.
         eta: new noise in each denoising step: 0 is the paper's deterministic DDIM, 1 ancestral sampling (ours); with
             `solver`, `spacing` and `steps` chosen on validation scenes (docs/experiments_duet1.md).
         noise_scale: standard deviation of that new noise. A model takes out a little more noise than there is, and
