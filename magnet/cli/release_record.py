@@ -11,6 +11,7 @@ from typing import Any
 from magnet import datamodules
 from magnet.body import load_body
 from magnet.cli.errors import CommandError
+from magnet.cli.run_record import with_stores
 from magnet.training import origins
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
@@ -52,11 +53,11 @@ def about(
     Raises:
         CommandError: `trained_on` or `licence` is needed.
     """
-    own = origins.data_of(checkpoint)
-    before = origins.started_from(checkpoint)
+    own, before = origins.data_of(checkpoint), origins.started_from(checkpoint)
     if decoder is not None:
         first, *others = origins.sources(decoder)
         before = origins.distinct([*before, first | {"part": "decoder"}, *others])
+    own, before = with_stores(own), with_stores(before)  # an earlier version did not record them as it trained
     known, all_known = ours(own), ours(own) and all(map(ours_of, before))
     require_said(known, all_known, trained_on, licence)
     everything = [own, *(each.get("data") or [] for each in before)]
@@ -120,15 +121,16 @@ def parts_of(data: Any) -> set[str]:
 
 
 def cmu(data: Any) -> bool:
-    """Whether a data configuration holds CMU's recordings, whichever takes of them."""
+    """Whether a data configuration holds CMU's recordings, whichever takes of them, also in a prepared store."""
     if isinstance(data, dict):
-        return str(data.get("class_path")).rpartition(".")[2] == "CMU" or any(map(cmu, data.values()))
+        own = str(data.get("class_path")).rpartition(".")[2] == "CMU" or data.get("store") == "cmu"
+        return own or any(map(cmu, data.values()))
     return isinstance(data, list) and any(map(cmu, data))
 
 
 def passed_on(source: dict[str, Any]) -> dict[str, Any]:
     """What a released model says of weights that it started from."""
-    said = {key: value for key, value in source.items() if key != "data"}
+    said = {key: value for key, value in source.items() if key != "data"} | {"name": without_folders(source["name"])}
     data = source.get("data") or []
     if ours(data):
         said |= {"trained on": {part: TRAINED_ON[part] for part in TRAINED_ON if part in parts_of(data)}}
@@ -166,8 +168,12 @@ def run_of(key: str, checkpoint: Path) -> dict[str, Any]:
     return {key: without_folders(json.loads(record.read_text(encoding="utf-8")))} if record.exists() else {}
 
 
-PLACE = r"(?:/|~[\w.-]*/|[A-Za-z]:[\\/])"
+PLACE = r"(?:file:/|/(?=\S)|\\\\|\.\.[\\/]|~[\w.-]*/|[A-Za-z]:[\\/])"
 """How the name of a place on some machine begins."""
+INSIDE = rf"(?:(?<=[\"'\[({{<, =])|(?<=:)(?!//)){PLACE}[^\"',\])}}>;]*"
+"""A place within a word, such as in a list or in brackets; of an address (https://) no part is one."""
+QUOTED = r"(?:\"[^\"]*\"|'[^']*'|\S)+"
+"""A word of a text; what is quoted holds together."""
 
 
 def without_folders(value: Any) -> Any:
@@ -184,7 +190,7 @@ def without_folders(value: Any) -> Any:
         words = shlex.split(value) if value.startswith("magnet ") else None
     except ValueError:  # no command, for all its first word
         words = None
-    return " ".join(map(_word, value.split(" "))) if words is None else shlex.join(map(_word, words))
+    return re.sub(QUOTED, lambda word: _word(word[0]), value) if words is None else shlex.join(map(_word, words))
 
 
 def _word(word: str) -> str:
@@ -194,8 +200,7 @@ def _word(word: str) -> str:
         return option[0] + str(without_folders(word[option.end() :]))
     if re.match(PLACE, word):
         return name_alone(word)
-    inside = rf"(?<=[\"'\[, ]){PLACE}[^\"',\]}}]*(?=[\"',\]}}])"
-    return re.sub(inside, lambda found: name_alone(found[0]), word)
+    return re.sub(INSIDE, lambda found: name_alone(found[0]), word)
 
 
 def name_alone(path: str) -> str:

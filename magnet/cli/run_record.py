@@ -12,6 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from magnet.cli.checkpoint_config import CONFIG_KEY
 from magnet.cli.provenance import provenance
 from magnet.cli.run_folder import LATEST
+from magnet.datamodules.store.reader import StoreError, StoreReader
 from magnet.files import require_place, write_text
 from magnet.training import origins
 from magnet.version import __version__
@@ -28,6 +29,25 @@ def seeds(options: dict[str, Any]) -> dict[str, Any]:
         found[f"{part}.seed"] = ((options.get(part) or {}).get("init_args") or {}).get("seed")
     known = {name: seed for name, seed in found.items() if seed is not None}
     return {"seed": known.get("seed", known.get("seed_everything")), "seeds": known}
+
+
+def with_stores(data: Any) -> Any:
+    """The same data configurations; to each prepared store of a data set is added its name, as `store`.
+
+    The path of a store says nothing of what it holds, and what the recordings ask for goes with the weights.
+    """
+    if isinstance(data, list):
+        return [with_stores(each) for each in data]
+    if not isinstance(data, dict):
+        return data
+    whole = {key: with_stores(value) for key, value in data.items()}
+    said = data.get("init_args") if "class_path" in data else None
+    place = (said.get("path") or said.get("root")) if isinstance(said, dict) else None
+    try:
+        name = StoreReader(place).manifest.get("name") if isinstance(place, str) else None
+    except StoreError:  # a folder of recordings, or one that is gone
+        name = None
+    return whole if name is None else whole | {"store": name}
 
 
 class Record(Callback):
@@ -87,7 +107,7 @@ class Record(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begin(trainer, pl_module)
-        origins.saw(getattr(pl_module, "origin", None), self.options.get("data"))
+        origins.saw(getattr(pl_module, "origin", None), with_stores(self.options.get("data")))
 
     def _end(self, *_: Any, **__: Any) -> None:
         link = self.folder.with_name(LATEST)

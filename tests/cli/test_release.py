@@ -16,6 +16,7 @@ from magnet import checkpoints, cli
 from magnet.cli import release
 from magnet.cli import release_record as record
 from magnet.cli.release_decoder import decoder_kept, with_decoder
+from magnet.datamodules.store.reader import FORMAT
 from magnet.testing import tiny_denoiser
 from magnet.training import origins
 
@@ -115,7 +116,13 @@ def test_a_released_folder_holds_no_folders_of_the_machine_that_trained(tuned: P
         ("magnet fit --config /a/b.yaml --data.path=/home/anna/store", "magnet fit --config b.yaml --data.path=store"),
         ("magnet fit --data.path '/home/anna b/store'", "magnet fit --data.path store"),
         ('magnet fit --data \'[{"path": "/home/anna b/store"}]\'', 'magnet fit --data \'[{"path": "store"}]\''),
-        ("https://example.org/a and/or b", "https://example.org/a and/or b"),
+        ("of the lab (/home/anna/store), and '/home/anna b/x' by ben:/srv/y", "of the lab (store), and 'x' by ben:y"),
+        ("file:///home/anna/store and (file:///home/anna/x)", "x)"),
+        ("read file:///home/anna/store, (file:///home/anna/x)", "read store, (x)"),
+        ("../../anna/store", "store"),
+        ("magnet fit --data.path '..\\anna\\store' --seed=../anna/x", "magnet fit --data.path store --seed=x"),
+        ('magnet fit --notes "3 / 4 time, in /home/anna b/x"', "magnet fit --notes '3 / 4 time, in x'"),
+        ("(https://example.org/a) and/or b", "(https://example.org/a) and/or b"),
         ("magnet isn't a command here", "magnet isn't a command here"),
     ],
 )
@@ -178,6 +185,22 @@ def test_recordings_of_cmu_are_acknowledged_whichever_takes_they_are(tmp_path: P
     mixed = {"class_path": "magnet.datamodules.Mixed", "init_args": {"data": [STORE, {**CMU, "init_args": {}}]}}
     said = record.about(checkpoints.read(path := run(tmp_path / "run", [mixed], [])), path, "mine", "mine")
     assert said["acknowledgement"] == record.ACKNOWLEDGEMENT
+
+
+@pytest.mark.parametrize("place", ["path", "root"])
+def test_recordings_of_cmu_in_a_store_are_acknowledged_where_it_lies_or_was_recorded(
+    place: str, tmp_path: Path
+) -> None:
+    manifest = {"name": "cmu", "format": FORMAT, "body": {"id": "open-1"}}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    there = {**STORE, "init_args": {place: str(tmp_path)}}
+    recorded, other = {**STORE, "store": "cmu"}, {**STORE, "store": "dd100"}
+    for data, owed in ((there, True), ([SYNTHETIC, {"data": recorded}], True), (recorded, True), (other, False)):
+        for own, before in ((data, []), (SYNTHETIC, [{"name": "C:\\anna\\last.ckpt", "data": [data]}])):
+            path = run(tmp_path / "run", [own], before)
+            said = record.about(checkpoints.read(path), path, "mine", "mine")
+            assert said.get("acknowledgement") == (record.ACKNOWLEDGEMENT if owed else None)
+            assert "anna" not in json.dumps(said)
 
 
 def test_the_body_is_that_of_the_checkpoint(tmp_path: Path) -> None:

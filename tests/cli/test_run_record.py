@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,9 @@ from lightning.pytorch import LightningModule, Trainer
 
 from magnet import cli
 from magnet.cli import doctor, run_record
+from magnet.datamodules.store.reader import FORMAT
 from magnet.files import CannotWrite
+from magnet.training import origins
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
@@ -27,6 +30,18 @@ def test_seeds_of_model_and_data_are_recorded_by_their_names() -> None:
         "seed": 5,
         "seeds": {"seed": 5, "seed_everything": 1, "data.seed": 3},
     }
+
+
+def test_what_a_prepared_store_holds_is_recorded_with_the_data(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text(json.dumps({"name": "cmu", "format": FORMAT, "body": {"id": "open-1"}}))
+    parts = [{"class_path": "Prepared", "init_args": {"path": path}} for path in (str(tmp_path), "gone")]
+    model = LightningModule()
+    model.origin = origins.begun()
+    mixed = {"class_path": "Mixed", "init_args": {"data": parts}}
+    record = run_record.Record(tmp_path / "run", "", {"data": mixed}, {})
+    record.on_train_start(Trainer(fast_dev_run=True, accelerator="cpu"), model)
+    (said,) = model.origin["data"]
+    assert said["init_args"]["data"] == [{**parts[0], "store": "cmu"}, parts[1]]
 
 
 @pytest.mark.parametrize("command", ["validate", "test", "predict"])
