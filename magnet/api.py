@@ -21,6 +21,7 @@ from magnet.export import reading
 from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
 from magnet.generation.crowd_start import SPACING, crowd_from_nothing, start_crowd
+from magnet.generation.inputs import warn_of_body
 from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
@@ -268,6 +269,7 @@ class Model:
             ValueError: as `magnet.generation.partner.Partner`.
         """
         plain, body = _with_its_body(past, "past")
+        warn_of_body(self.denoiser, plain)
         how = (_slots("agents", agents, plain.agents, "past has people"), self.sampler, self._generator(seed), block)
         partner = LivePartner(self.denoiser, plain, *how)
         partner.model = body
@@ -299,6 +301,7 @@ class Model:
         """
         kind = registry.get(task)
         plain, body = _with_its_body(scene)
+        warn_of_body(self.denoiser, plain)
         slots = scene.agents
         require_whole("context", context, 0)
         require_whole("samples", samples, 1)

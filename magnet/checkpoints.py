@@ -269,6 +269,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
         "epoch": 0,
         "global_step": kept.pop("steps"),
         **kept,
+        "about": config.get("about"),
     }
 
 

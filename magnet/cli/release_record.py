@@ -34,7 +34,6 @@ ACKNOWLEDGEMENT = (
     "The data used in this project was obtained from mocap.cs.cmu.edu. "
     "The database was created with funding from NSF EIA-0196217."
 )
-UNKNOWN = "not recorded"
 SHOWN = 3
 """So many of the weights that a model started from are told in words, whatever they are."""
 
@@ -137,17 +136,16 @@ def passed_on(source: dict[str, Any]) -> dict[str, Any]:
     elif data:
         said |= {"data": without_folders(data)}
     elif "trained on" not in said:
-        said |= {"trained on": UNKNOWN}
+        said |= {"trained on": origins.UNKNOWN}
     return said
 
 
 def body_of(checkpoint: dict[str, Any]) -> str:
     """The id of the body that a model was trained with, where its checkpoint tells."""
-    body = (checkpoint.get(origins.KEY) or {}).get("body")
-    if body is not None:
-        return str(body)
+    if (body := origins.body_of(checkpoint)) is not None:
+        return body
     models = {(each.get("init_args") or {}).get("body_model") for each in origins.data_of(checkpoint)}
-    return load_body().id if models == {"open"} else UNKNOWN
+    return load_body().id if models == {"open"} else origins.UNKNOWN
 
 
 def manifest(singles: bool = True) -> dict[str, str]:

@@ -25,6 +25,7 @@ from magnet.tokenizer.core import TokenizerCore
 from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.tokenizer.raw import RawPose
+from magnet.training import origins
 from magnet.waiting import may_look
 
 
@@ -40,6 +41,7 @@ class TokenModelCore(nn.Module):
     normalizer: Normalizer
     window: int  # token steps that the network sees at once
     sampling: Sampling = Sampling()  # how it is best sampled
+    trained_body: str | None = None  # id of the body that its weights were trained with; None: nobody recorded it
 
     def __init__(self) -> None:
         super().__init__()
@@ -118,6 +120,7 @@ class TokenModelCore(nn.Module):
         """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
         checkpoint.update(renamed_checkpoint(checkpoint))
         checkpoints.require_denoiser(checkpoint)
+        self.trained_body = origins.body_of(checkpoint)
         stored = checkpoint["tokenizer_hyper_parameters"]
         given = dict(self.tokenizer.hparams) if self.built and isinstance(self.tokenizer, TokenizerCore) else None
         if not self.built or stored != given:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import torch
 from torch import Tensor
 
 from magnet.body.base import MOST_SHAPE
-from magnet.body.floor import MOMENTS, lowest, off_floor
+from magnet.body.floor import MOMENTS, lowest, off_floor, open_body
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.export.misread import misread, steps_of
@@ -53,6 +54,24 @@ def check_request(
     if scene.agents > model.layout.agents:
         raise ValueError(f"the scene has {scene.agents} agents, the model was built for {model.layout.agents}")
     require_rate(scene)
+
+
+def other_body(model: DenoiserCore, scene: Scene) -> str | None:
+    """Says that people have another body than those whom a model learned from; None: they have the same."""
+    trained = model.trained_body
+    if trained in (None, scene.body):
+        return None
+    advice = "leave the body out" if trained == open_body().id else "give its file: body=FILE, or --body FILE"
+    return (
+        f"the model was trained with body {trained!r}, but these people have {scene.body!r}, whose shape numbers mean "
+        f"something else; {advice}"
+    )
+
+
+def warn_of_body(model: DenoiserCore, scene: Scene) -> None:
+    """Warns whoever called a model's method where `other_body` says something."""
+    if (said := other_body(model, scene)) is not None:
+        warnings.warn(said, stacklevel=3)
 
 
 def check_condition(cond: Tensor | None, scenes: int, weight: float) -> None:

@@ -13,6 +13,8 @@ from magnet.files import file_hash
 KEY = "magnet_origin"
 """Under which a checkpoint says it."""
 STARTED = "started from"
+UNKNOWN = "not recorded"
+"""What a released model says of a body, or of data, that nobody recorded."""
 SAID = ("trained on", "acknowledgement", "licence")
 """What a released model says of itself, and those who start from it pass on."""
 
@@ -54,6 +56,12 @@ def data_of(checkpoint: dict[str, Any]) -> list[Any]:
     seen = (checkpoint.get(KEY) or {}).get("data")
     last = (checkpoint.get("magnet_config") or {}).get("data")
     return list(seen) if seen else [last] if last else []
+
+
+def body_of(checkpoint: dict[str, Any]) -> str | None:
+    """The id of the body that a checkpoint or a released model was trained with; None where it does not say it."""
+    said = (checkpoint.get(KEY) or {}).get("body") or (checkpoint.get("about") or {}).get("body")
+    return None if said in (None, UNKNOWN) else str(said)
 
 
 def started_from(checkpoint: dict[str, Any]) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,31 @@ def test_the_folder_is_loaded_and_sampled_like_any_model(tuned: Path) -> None:
     words = ("--people", "2", "--frames", "12", "--sampler.steps", "1", "--out", "made.npz")
     assert cli.main(["predict", "--ckpt_path", "models/mine", *words]) == 0
     assert Path("made.npz").is_file()
+
+
+def test_people_of_another_body_than_a_released_models_are_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("--people", "2", "--frames", "12", "--sampler.steps", "1", "--out", "made.npz")
+    for body, told in (("smplx-neutral", "give its file: body=FILE, or --body FILE"), ("open-1", None)):
+        path = run(tmp_path / "runs" / body, [STORE], [], body=body)
+        assert cli.main(["release", str(path), body, *SAID]) == 0
+        capsys.readouterr()
+        assert cli.main(["predict", "--ckpt_path", body, *words]) == 0
+        shown = (
+            f"warning: the model was trained with body '{body}', but these people have 'open-1', "
+            in capsys.readouterr().out
+        )
+        assert shown == bool(told)
+        made = magnet.read("made.npz")
+        for name in (body, path):
+            model = magnet.load(name, steps=1)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                model.generate(frames=8)
+                model.partner(made)
+            assert [str(each.message).rpartition("; ")[2] for each in caught] == ([told, told] if told else [])
 
 
 def test_a_released_folder_holds_no_folders_of_the_machine_that_trained(tuned: Path) -> None:
