@@ -37,9 +37,11 @@ for example:
 """
 
 
-def parser() -> argparse.ArgumentParser:
+def parser(out: bool = True) -> argparse.ArgumentParser:
+    """All options; without `out`, OUT is one of IN."""
     options = scene_files.parser_of("export", __doc__, EPILOG)
-    options.add_argument("out", **scene_files.OUT)
+    if out:
+        options.add_argument("out", **scene_files.OUT)
     scene_files.add_body(options)
     add = options.add_argument
     add("--scene", type=int, metavar="N", help="only the Nth of the file's scenes, from 0")
@@ -75,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code."""
-    options = parser().parse_intermixed_args(list(arguments))
+    options = parser().parse_intermixed_args(out_before_rig(arguments))
     from magnet.body import on_floor
     from magnet.export import formats
     from magnet.export.bones import BoneOptions
@@ -129,6 +131,25 @@ def main(arguments: Sequence[str] = ()) -> int:
     )
     scene_files.say_written(written)
     return 0
+
+
+def out_before_rig(arguments: Sequence[str]) -> list[str]:
+    """The words, with OUT in front of --rig, which takes all words behind it, where the last of these is OUT.
+
+    It is where one file alone is named elsewhere, or where those are all there and it is not.
+    """
+    words = list(arguments)
+    if "--rig" not in words:
+        return words
+    at = words.index("--rig")
+    end = next((n for n in range(at + 1, len(words)) if words[n].startswith("-")), len(words))
+    before, rigs, behind = words[:at], words[at:end], words[end:]
+    if len(rigs) < 3:
+        return words
+    files = parser(out=False).parse_intermixed_args([*before, *behind]).inputs
+    if len(files) > 1 and (Path(rigs[-1]).exists() or not Path(files[-1]).exists()):
+        return words
+    return [*before, rigs[-1], *rigs[:-1], *behind]
 
 
 def refuse_unused(options: argparse.Namespace, suffix: str) -> None:

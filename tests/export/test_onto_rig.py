@@ -184,6 +184,25 @@ def test_the_command_writes_a_file_a_person_and_says_what_cannot_be(
         assert said in error and len(error.splitlines()) == 1
 
 
+def test_out_may_stand_behind_the_characters(
+    salsa: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for number in range(2):
+        save_bvh(salsa.slice(0, 8).permute_agents(torch.tensor([number])), f"{number}.bvh", body)
+    save_bvh(someone(salsa), "hero.bvh", body)
+    for words, name in (
+        ("0.bvh --rig hero.bvh one.bvh", "one"),  # and again, when it is there
+        ("0.bvh --rig hero.bvh one.bvh", "one"),
+        ("--fps 30 0.bvh 1.bvh --rig hero.bvh hero.bvh two.bvh --on_floor", "two_person1"),
+        ("0.bvh 1.bvh three.bvh --rig hero.bvh hero.bvh", "three_person0"),
+    ):
+        assert cli.main(["export", *words.split()]) == 0
+        assert f"{name}.bvh" in capsys.readouterr().out and Path(f"{name}.bvh").is_file()
+    assert cli.main(["export", *["0.bvh", "1.bvh", "four.bvh", "--rig", "hero.bvh", "her.bvh"]]) == 2
+    assert "--rig her.bvh: no such file" in capsys.readouterr().err
+
+
 def test_several_scenes_get_a_file_a_person_each(salsa: Scene, body: Body, tmp_path: Path) -> None:
     rig = save_glb(someone(salsa), tmp_path / "rig.glb", body)
     written = formats.write(salsa.repeat(2), tmp_path / "out.glb", body, rigs=[rig])
