@@ -36,10 +36,16 @@ def require_one_clock(paths: Sequence[Path], rates: Sequence[float], start: int,
 
 
 def rates_note(rates: Sequence[float], fps: float) -> list[str]:
-    """A note that files of several rates were resampled; none where all have one.
+    """A note that files were resampled; none where all have this rate.
 
     >>> rates_note([120.0, 30.0, 120.0], 30.0)
     ['files of 30 and 120 frames a second, all brought to 30']
+    >>> rates_note([120.0], 30.0), rates_note([30.0], 30.0)
+    (['resampled from 120 to 30 frames a second'], [])
     """
     different = list(dict.fromkeys(f"{rate:g}" for rate in sorted(rates)))
-    return [f"files of {' and '.join(different)} frames a second, all brought to {fps:g}"] * (len(different) > 1)
+    if different in ([], [f"{fps:g}"]):
+        return []
+    if len(different) == 1:
+        return [f"resampled from {different[0]} to {fps:g} frames a second"]
+    return [f"files of {' and '.join(different)} frames a second, all brought to {fps:g}"]

@@ -133,6 +133,7 @@ def read(
     notes = [note for one in people for note in one.notes]
     if len(scenes) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
+        notes += rates_note([scenes[0].fps], scene.fps)
         return _grounded(scene, body, notes, () if options.keep_floor else foreign)
     for file, scene in zip(files, scenes, strict=True):
         if scene.scenes != 1:

@@ -58,6 +58,18 @@ def test_files_of_two_rates_have_no_part_in_common(suffix: str, duet: Scene, bod
     assert not any("brought" in note for note in reading.read(written[:1] * 2, options=reading.Reading(fps=20.0)).notes)
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".bvh", ".csv"])
+@pytest.mark.parametrize("files", [1, 2])
+def test_files_of_another_rate_are_said_to_be_resampled(
+    files: int, suffix: str, duet: Scene, body: Body, tmp_path: Path
+) -> None:
+    one = duet.slice(0, 8).replace(present=torch.tensor([[True, False]])).people()
+    written = [formats.write(one, tmp_path / f"{n}{suffix}", body)[0] for n in range(files)]
+    for rate, said in ((15.0, ["resampled from 30 to 15 frames a second"]), (30.0, []), (None, [])):
+        notes = reading.read(written, options=reading.Reading(fps=rate)).notes
+        assert [note for note in notes if "resampled" in note] == said
+
+
 def test_several_npz_are_several_people(duet: Scene, body: Body, tmp_path: Path):
     from magnet.export import save_smplx
 
