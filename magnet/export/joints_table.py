@@ -17,6 +17,8 @@ from magnet.files import regular
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
 """A joint's name, an axis, and perhaps a unit: left_hip_x_m, LeftHip.X, nose_y (mm)."""
+AXIS_FIRST = re.compile(r"(?i)^([xyz])[ _.:-]+(.+?)(?:[ _.(\[]+(mm|cm|m)[)\]]?)?$")
+"""An axis, a joint's name, and perhaps a unit: x_LHip, X.LeftHip (mm)."""
 FRAME, TIME = ("frame", "frame_id", "frame_index"), ("time_s", "time", "seconds", "t", "timestamp")
 PERSON = ("person", "person_id", "id", "track", "track_id", "subject", "actor", "skeleton")
 NEAR = 0.3
@@ -42,10 +44,10 @@ class JointTable:
 def read_table(path: str | Path) -> JointTable:
     """Read a table of joint positions: a row for each frame and person, three columns for each joint.
 
-    Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`), and by `frame`, `person` and
-    `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in order, of
-    several people those of one time are one frame; without `time_s` the rate is not known. Cells may be empty, and a
-    joint at 0, 0, 0 is missing, too.
+    Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`, `x_left_hip`), and by `frame`,
+    `person` and `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in
+    order, of several people those of one time are one frame; without `time_s` the rate is not known. Cells may be
+    empty, and a joint at 0, 0, 0 is missing, too.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -58,9 +60,10 @@ def read_table(path: str | Path) -> JointTable:
         sign = max(",;\t", key=first.count)
         lines = csv.reader(file, delimiter=sign)
         try:
-            rows = [row for row in lines if any(map(str.strip, row))]
+            numbered = [(lines.line_num, row) for row in lines if any(map(str.strip, row))]
         except csv.Error as error:
             raise ValueError(f"{path}, line {lines.line_num}: {error}; write it again as a table") from error
+    at_line, rows = [line for line, _ in numbered], [row for _, row in numbered]
     if len(rows) < 2:
         raise ValueError(f"{path}: holds no rows under a line of names")
     head = [name.strip() for name in rows[0]]
@@ -70,9 +73,7 @@ def read_table(path: str | Path) -> JointTable:
         next((words.index(name) for name in names if name in words), None)  # the surest name first
         for names in (FRAME, TIME, PERSON, ("scene",))
     )
-    numbers = np.array(
-        [[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in enumerate(rows[1:], 2)]
-    )
+    numbers = np.array([[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in numbered[1:]])
     if scene_at is not None and len(scenes := {row[scene_at].strip() for row in rows[1:]}) > 1:
         raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
     told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
@@ -87,7 +88,8 @@ def read_table(path: str | Path) -> JointTable:
     for number, (t, person) in enumerate(zip(frame.tolist(), told, strict=True)):
         if (t, person) in seen:
             who = f" of {person}" if person else ""
-            raise ValueError(f"{path}, line {number + 2}: a second row{who} for frame {t}; is a column person missing?")
+            line = at_line[number + 1]
+            raise ValueError(f"{path}, line {line}: a second row{who} for frame {t}; is a column person missing?")
         seen.add((t, person))
         at[t, people.index(person)] = numbers[number][where]
     at[~np.isfinite(at)] = np.nan
@@ -99,14 +101,18 @@ def read_table(path: str | Path) -> JointTable:
 
 
 def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str | None]:
-    """The three columns of each joint, and the unit that they say."""
-    found: dict[str, dict[str, int]] = {}
-    said: dict[str, set[str | None]] = {}
-    for k, name in enumerate(head):
-        if (match := COLUMN.match(name)) and name.lower() not in (*FRAME, *TIME, *PERSON):
-            found.setdefault(match[1], {})[match[2].lower()] = k
-            said.setdefault(match[1], set()).add(match[3].lower() if match[3] else None)
-    whole = {name: [axes[axis] for axis in "xyz"] for name, axes in found.items() if len(axes) == 3}
+    """The three columns of each joint, and the unit that they say; the axis is behind the names, or before them all."""
+    whole: dict[str, list[int]] = {}
+    for pattern, joint, of in ((COLUMN, 1, 2), (AXIS_FIRST, 2, 1)):
+        found: dict[str, dict[str, int]] = {}
+        said: dict[str, set[str | None]] = {}
+        for k, name in enumerate(head):
+            if (match := pattern.match(name)) and name.lower() not in (*FRAME, *TIME, *PERSON):
+                found.setdefault(match[joint], {})[match[of].lower()] = k
+                said.setdefault(match[joint], set()).add(match[3].lower() if match[3] else None)
+        whole = {name: [axes[axis] for axis in "xyz"] for name, axes in found.items() if len(axes) == 3}
+        if whole:
+            break
     units = set().union(*(said[name] for name in whole))  # a column `index`, which ends in x, is no joint's
     if not whole:
         raise ValueError(
@@ -139,6 +145,12 @@ def _frames(
         for person in told:
             frames.append(count.setdefault(person, 0))
             count[person] += 1
+        if len(set(count.values())) > 1:
+            few, many = min(count, key=count.__getitem__), max(count, key=count.__getitem__)
+            raise ValueError(
+                f"{path}: {few} has fewer rows ({count[few]}) than {many} ({count[many]}), and nothing says at which "
+                "frames; add a column frame or time_s"
+            )
         return np.array(frames), 1
     said = numbers[:, column]
     if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:

@@ -23,6 +23,8 @@ def table(path: Path, *lines: str) -> Path:
         ("left_hip.X,left_hip.Y,left_hip.Z", None),
         ("left_hip x (mm),left_hip y (mm),left_hip z (mm)", "mm"),
         ("left_hipX_cm,left_hipY_cm,left_hipZ_cm", "cm"),
+        ("x_left_hip,y_left_hip,z_left_hip", None),
+        ("X.left_hip (mm),Y.left_hip (mm),Z.left_hip (mm)", "mm"),
     ],
 )
 def test_columns_are_joints_by_axis_and_unit(head: str, unit: str | None, tmp_path: Path) -> None:
@@ -55,6 +57,9 @@ def test_columns_that_merely_end_in_an_axis_or_could_be_a_person_are_passed_over
         (["a_x,a_y,a_z"], "holds no rows under a line of names"),
         (["a_x,a_y,a_z", "1,2"], "line 2: 2 cells, fewer than names"),
         (["frame,a_x,a_y,a_z", "1,0,0,0", "1,0,0,0"], "line 3: a second row for frame 0; is a column person missing"),
+        (["frame,a_x,a_y,a_z", "", "1,0,0,0", ",,,", "1,0,0,0"], "line 5: a second row for frame 0"),
+        (["a_x,a_y,a_z", "", "1,2"], "line 3: 2 cells, fewer than names"),
+        (["id,a_x,a_y,a_z", "A,1,2,3", "A,1,2,3", "B,1,2,3"], "B has fewer rows .1. than A .2., and .* add a column"),
         (["frame,a_x,a_y,a_z", "0.5,0,0,0"], "frame 0.5: expected whole numbers"),
         (["frame,a_x,a_y,a_z", "nan,0,0,0"], "frame nan: expected whole numbers"),
         (["a_x,a_y,a_z", "0,1e9,0"], r"a joint is 1e\+09 away: numbers are damaged"),
