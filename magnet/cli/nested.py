@@ -5,6 +5,7 @@ The parser tells of an option by its class's own name for it, as `batch_size` of
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
@@ -152,6 +153,22 @@ def with_place(layers: Sequence[str], files: Sequence[str], flags: Sequence[str]
         return told.replace(f"--{field}", ": ".join(found), 1)
     place = place_of(layers, field, got)
     return told.replace(f"--{field}", place[0], 1) if place else told
+
+
+def no_class(files: Sequence[str], flags: Sequence[str], key: str, name: str, known: Collection[str]) -> str:
+    """Says that there is no such class, with its place where a file names it, and what may be meant.
+
+    Args:
+        files: the user's own, of YAML.
+        flags: the command line, which beats them.
+        key: what the class is: model or data.
+        known: the short names that there are.
+    """
+    given = any(value.strip("'\"") == name for _, value in valued(flags))
+    found = None if given else in_files(files, "class_path", name) or in_files(files, key, name)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}, or give a dotted path of your own"
+    return f"{': '.join(found)}: no {key} {name}; {hint}" if found else f"no {key} {name}; {hint}"
 
 
 def of_task(files: Sequence[str], flags: Sequence[str], told: str) -> str:

@@ -18,7 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
-from magnet.cli.nested import as_key, flat_key, in_files, place_of, with_place
+from magnet.cli.nested import as_key, flat_key, in_files, no_class, place_of, with_place
 
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
@@ -194,8 +194,7 @@ class Parser(LightningArgumentParser):
         named = re.search(r'Parser key "(\w+)"', message)
         path = re.search(r"(?:Expected a dot import path string|Unexpected import path format): (\S+)", message)
         if named and path and named[1] in self.classes:
-            known = ", ".join(self.classes[named[1]])
-            return f"no {named[1]} {path[1]}; there are {known}, or give a dotted path of your own"
+            return no_class(self.files, self.arguments, named[1], path[1], self.classes[named[1]])
         key = re.search(r'Parser key "([\w.]+)"', message)
         if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
             return with_place(self.layers, self.files, self.arguments, told)

@@ -105,7 +105,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
     files = [*files, *seed_of_samples(files, words)] if command in SAMPLING else files
     settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
-    require_data(settled.classes.get("data"))
+    require_data(settled.classes.get("data"), [each.path for each in given.layers], words)
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
     task = None
@@ -123,8 +123,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     return Request(command, words, layers, read, checkpoint, folder, not out, settled.classes, task, sampled)
 
 
-def require_data(name: str | None) -> None:
-    """Refuse the short name of a data set that there is not, before anything else is told of it.
+def require_data(name: str | None, files: list[str], flags: list[str]) -> None:
+    """Refuse the short name of a data set that there is not, in a file or a flag, before anything else is told of it.
 
     Raises:
         CommandError: says why it failed to load where a package offers it, or else what there is.
@@ -136,7 +136,7 @@ def require_data(name: str | None) -> None:
         registry.DATA.require_loaded(name)
     except ValueError as error:
         raise CommandError(str(error)) from error
-    raise CommandError(f"no data {name}; there are {', '.join(known)}, or give a dotted path of your own")
+    raise CommandError(nested.no_class(files, flags, "data", name, known))
 
 
 def run_name(command: str, files: list[str]) -> str:

@@ -44,6 +44,18 @@ def test_a_wrong_option_of_a_data_set_in_a_mixture_is_named_by_its_place(
             "model:\n  class_path: Denoiser\n  init_args:\n    sampling: {settle: nonsense}\n",
             "line 4: model.init_args.sampling.settle: got nonsense, expected off, light, firm, hold or null",
         ),
+        (
+            "fit",
+            "data:\n  class_path: Sinthetic\n",
+            "line 2: data.class_path: no data Sinthetic; did you mean Synthetic?",
+        ),
+        ("fit", "data: Sinthetic\n", "line 1: data: no data Sinthetic; did you mean Synthetic?"),
+        ("fit", "model:\n  class_path: Foo\n", "line 2: model.class_path: no model Foo; there are Denoiser, Tokenizer"),
+        (
+            "fit",
+            "data:\n  class_path: Mixed\n  init_args:\n    data:\n    - class_path: Sinthetic\n",
+            "line 5: data.init_args.data[0].class_path: no data Sinthetic; did you mean Synthetic?",
+        ),
         ("fit", "trainer:\n  max_steps: many\n", "line 2: trainer.max_steps: got many, expected a whole number"),
         ("test", "samples: [3]\n", "line 1: samples: got [3], expected a whole number"),
         (

@@ -208,7 +208,8 @@ def test_a_data_set_that_is_not_there_is_told_with_the_reason_and_nothing_before
     words = ["--data", name] if named_by == "flag" else ["--config", "theirs.yaml"]
     assert cli.main(["fit", "--model", "Tokenizer", "--config", "ours.yaml", *words]) == 2
     told = capsys.readouterr().err
-    assert told.startswith(said) and told.count("\n") == 1
+    assert told.replace("theirs.yaml, line 1: data: ", "").startswith(said) and told.count("\n") == 1
+    assert ("theirs.yaml, line 1: " in told) == (named_by == "file" and name == "Nowhere")
 
 
 def test_preparing_says_why_a_reader_is_not_there(offered: list[Point], capsys) -> None:
