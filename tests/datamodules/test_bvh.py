@@ -45,7 +45,7 @@ def test_what_a_file_means_is_said_in_its_notes(made: Path) -> None:
     reader = BVHReader(made)
     (note,) = reader.read(reader.takes()[0]).notes
     assert note == "names of 3ds Max Biped, Unreal, Rigify, Character Creator, 18 joints; cm, +z up, 120 fps"
-    assert reader.summary() == ["4 scenes of 2 files: walk1 (A, B), walk2 (A, B), walk3 (A, B), walk4 (A, B)"]
+    assert reader.summary() == ["4 scenes of 2 files each: walk1 (A, B), walk2 (A, B), walk3 (A, B), walk4 (A, B)"]
 
 
 def test_a_skeleton_of_the_bodys_own_comes_back_exactly(tmp_path: Path) -> None:

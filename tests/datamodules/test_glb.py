@@ -57,7 +57,7 @@ def motionless(path: Path) -> Path:
 
 def test_people_of_one_file_are_one_scene(made: Path) -> None:
     reader = GLBReader(made)
-    assert reader.summary() == ["4 scenes of 1 file: walk1, walk2, walk3, walk4"]
+    assert reader.summary() == ["4 scenes of 1 file each: walk1, walk2, walk3, walk4"]
     found = reader.read(reader.takes()[0])
     assert (found.persons, found.fps, found.up) == (("dancer1", "dancer2"), 60.0, "+y")
     assert found.notes == ("names of Mixamo, MotionBuilder, 18 joints; m, +y up, 60 fps",)

@@ -182,7 +182,7 @@ class OwnReader(Reader, Generic[T]):
         sizes = Counter(len(group.people) for group in groups.values())
         said = []
         for size, count in sorted(sizes.items(), reverse=True):
-            scenes, files = "scene" + "s" * (count > 1), "file" + "s" * (size > 1)
+            scenes, files = "scene" + "s" * (count > 1), "file" + "s" * (size > 1) + " each" * (count > 1)
             said.append(f"{count} {scenes} of {size} {files}: {_some(groups, size)}")
         if set(sizes) == {1} and self.table is None and self.pattern is None and self.one_person_a_file:
             said.append(f"everybody is alone: no names tell who was recorded together; if some were, {HOW}")
