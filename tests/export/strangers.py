@@ -42,7 +42,8 @@ NAMINGS: dict[str, dict[str, str]] = {
                      ["Thigh", "Shin", "Foot", "Toe", "Shoulder", "UArm", "FArm", "Hand"]),
     "smpl": _named("Pelvis", ["Spine1", "Spine2", "Spine3"], "Neck", "Head", "{S}_{word}",
                    ["Hip", "Knee", "Ankle", "Foot", "Collar", "Shoulder", "Elbow", "Wrist"]),
-    "rigify": _named("hips", ["spine", "spine.001", "chest"], "neck", "head", "{word}.{S}",
+    "rigify": _named("DEF-spine", ["DEF-spine.001", "DEF-spine.002", "DEF-spine.003"], "DEF-spine.004",
+                     "DEF-spine.006", "DEF-{word}.{S}",
                      ["thigh", "shin", "foot", "toe", "shoulder", "upper_arm", "forearm", "hand"]),
 }  # fmt: skip
 

@@ -88,6 +88,22 @@ SKELETONS: dict[str, tuple[str, str]] = {
         "shoulder_L arm_L elbow_L wrist_L shoulder_R arm_R elbow_R wrist_R",
         "leg_L knee_L ankle_L toe_L shoulder_L arm_L elbow_L wrist_L neck head",
     ),
+    "Rigify's bones that deform": (
+        "DEF-spine DEF-pelvis.L DEF-pelvis.R DEF-thigh.L DEF-thigh.L.001 DEF-shin.L DEF-shin.L.001 DEF-foot.L "
+        "DEF-toe.L DEF-thigh.R DEF-thigh.R.001 DEF-shin.R DEF-shin.R.001 DEF-foot.R DEF-toe.R DEF-spine.001 "
+        "DEF-spine.002 DEF-spine.003 DEF-spine.004 DEF-spine.005 DEF-spine.006 DEF-breast.L DEF-breast.R "
+        "DEF-shoulder.L DEF-upper_arm.L DEF-upper_arm.L.001 DEF-forearm.L DEF-forearm.L.001 DEF-hand.L DEF-palm.01.L "
+        "DEF-f_index.01.L DEF-thumb.01.L DEF-shoulder.R DEF-upper_arm.R DEF-upper_arm.R.001 DEF-forearm.R "
+        "DEF-forearm.R.001 DEF-hand.R",
+        "DEF-thigh.L DEF-shin.L DEF-foot.L DEF-toe.L DEF-shoulder.L DEF-upper_arm.L DEF-forearm.L DEF-hand.L "
+        "DEF-spine.004 DEF-spine.006",
+    ),
+    "Rigify's human": (
+        "spine spine.001 spine.002 spine.003 spine.004 spine.005 spine.006 face nose ear.L jaw pelvis.L pelvis.R "
+        "breast.L breast.R shoulder.L upper_arm.L forearm.L hand.L palm.01.L f_index.01.L thumb.01.L shoulder.R "
+        "upper_arm.R forearm.R hand.R thigh.L shin.L foot.L toe.L heel.02.L thigh.R shin.R foot.R toe.R heel.02.R",
+        "thigh.L shin.L foot.L toe.L shoulder.L upper_arm.L forearm.L hand.L spine.004 spine.006",
+    ),
     "Advanced Skeleton": (
         "Root_M Hip_R Knee_R Ankle_R Toes_R Spine1_M Chest_M Neck_M Head_M Collar_R Shoulder_R Elbow_R Wrist_R "
         "Collar_L Shoulder_L Elbow_L Wrist_L Hip_L Knee_L Ankle_L Toes_L",
@@ -118,12 +134,3 @@ def test_numbers_that_tell_joints_apart_stay() -> None:
 def test_the_middle_of_a_body_is_no_side() -> None:
     assert split_side("C_Hips") == split_side("Hips_M") == ("", {"hips"})
     assert split_side("L_Hip")[0] == "left" and split_side("chest") == ("", {"chest"})
-
-
-def test_rigifys_numbered_spine_ends_in_neck_and_head() -> None:
-    limbs = ("thigh", "shin", "foot", "toe", "shoulder", "upper_arm", "forearm", "hand")
-    spine = ["DEF-spine", *(f"DEF-spine.{k:03}" for k in range(1, 7))]
-    names = [*spine, *(f"DEF-{limb}.{side}" for side in "LR" for limb in limbs)]
-    found = recognised(names)
-    mapped = {JOINT_NAMES[j]: names[k] for j, k in found.joints.items()}
-    assert mapped["neck"] == "DEF-spine.004" and mapped["head"] == "DEF-spine.006" and len(mapped) == 18
