@@ -83,6 +83,11 @@ class PlainParser(argparse.ArgumentParser):
         )
         self.command = command
         self.elsewhere: dict[str, str] = {}  # options of other commands, and what is to be done instead
+        self.given: list[str] = []
+
+    def parse_known_intermixed_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self.given = list(args or ())
+        return super().parse_known_intermixed_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)
@@ -90,9 +95,8 @@ class PlainParser(argparse.ArgumentParser):
         hint = closest(name, list(self._option_string_actions)) if unknown else ""
         hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
         message = f"no option {name}" if unknown else message  # as the commands with a Trainer say it
-        several = [
-            action.option_strings[0] for action in self._actions if action.option_strings and action.nargs == "+"
-        ]
+        said = self.given
+        several = [flag for each in self._actions if each.nargs == "+" for flag in each.option_strings if flag in said]
         if message.endswith("required: OUT") and several:
             hint = f"; files stand first, then options, for {several[0]} takes all words behind it"
         print(refused(self.command, message + hint), file=sys.stderr)

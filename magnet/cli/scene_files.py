@@ -157,6 +157,8 @@ def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None
 
     path = Path(out)
     if path.suffix.lower() not in formats.WRITTEN:
+        if path.is_dir():
+            raise CommandError(f"{out}: is a folder, expected the name of a file, such as {path / 'scene.glb'}")
         known = ", ".join(formats.WRITTEN)
         raise CommandError(f"{path.name}: nothing writes {path.suffix or 'files without a suffix'}; use {known}")
     if whole and len(inputs) > 1:  # several files are as many people, or more

@@ -148,8 +148,8 @@ def _frames(
         if len(set(count.values())) > 1:
             few, many = min(count, key=count.__getitem__), max(count, key=count.__getitem__)
             raise ValueError(
-                f"{path}: {few} has fewer rows ({count[few]}) than {many} ({count[many]}), and nothing says at which "
-                "frames; add a column frame or time_s"
+                f"{path}: person {few} has fewer rows ({count[few]}) than {many} ({count[many]}), and nothing says "
+                "at which frames; add a column frame or time_s"
             )
         return np.array(frames), 1
     said = numbers[:, column]

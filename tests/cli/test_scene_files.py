@@ -119,6 +119,11 @@ def test_files_that_out_has_taken_are_not_written_over(
 def test_an_option_that_took_the_file_to_write_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, "refine", "duet.npz", "--shapes", "duet.npz", "o.npz")
     assert "files stand first, then options, for --shapes takes all words behind it" in said
+    for command in ("refine", "export"):
+        assert refused(capsys, command, "duet.npz").endswith(f"required: OUT. See magnet {command} --help\n")
+        assert ".: is a folder, expected the name of a file, such as scene.glb" in refused(
+            capsys, command, "duet.npz", "."
+        )
 
 
 @pytest.mark.parametrize("command", ["refine", "export"])
