@@ -188,6 +188,8 @@ def _opened(data: bytes) -> tuple[dict[str, Any], bytes]:
         if document["asset"]["version"][:2] != "2.":
             raise ValueError(f"it is glTF {document['asset']['version']}, expected 2.0")
         return document, b""
+    if len(data) < 20:
+        raise ValueError(f"it has {len(data)} bytes")
     magic, version, length = struct.unpack_from("<4sII", data)
     size, kind = struct.unpack_from("<I4s", data, 12)
     if magic != b"glTF" or version != 2 or kind != b"JSON":

@@ -51,11 +51,14 @@ def read_table(path: str | Path) -> JointTable:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no such columns, rows that are cut short, two rows of one frame and person, several scenes.
+        ValueError: no text in UTF-8, no such columns, rows that are cut short, two rows of one frame and person, frames
+            that nothing tells, several scenes.
     """
     path = Path(path)
     with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
         first = file.readline()
+        if "\0" in first:
+            raise ValueError(f"{path}: is no text in UTF-8; save it again as CSV UTF-8")
         file.seek(0)
         sign = max(",;\t", key=first.count)
         lines = csv.reader(file, delimiter=sign)

@@ -197,7 +197,7 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
     whole = path.read_bytes()
     for data in (b"", b"glTF", b"PK\x03\x04 something else that is long enough", whole[:100], whole[:-9]):
         path.write_bytes(data)
-        with pytest.raises(ValueError, match=r"a\.glb: not a whole \.glb file \(.+\): export it again"):
+        with pytest.raises(ValueError, match=r"a\.glb: not a whole \.glb file \(it .+\): export it again"):
             read_glb(path)
 
 

@@ -76,6 +76,12 @@ def test_what_cannot_be_meant_is_refused_in_one_line(lines: list[str], said: str
     assert str(caught.value).startswith(str(tmp_path / "a.csv")) and "\n" not in str(caught.value)
 
 
+def test_a_table_in_another_encoding_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes("a_x,a_y,a_z\n1,2,3\n".encode("utf-16"))
+    with pytest.raises(ValueError, match=r"a\.csv: is no text in UTF-8; save it again as CSV UTF-8"):
+        read_table(tmp_path / "a.csv")
+
+
 def test_without_frames_rows_of_one_time_are_of_one_frame(tmp_path: Path) -> None:
     lines = ["time_s,person,a_x,a_y,a_z"]
     for t in range(5):
