@@ -38,6 +38,8 @@ HUB = "hub:"
 """Prefix of the name of a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
 HUB_FILES = ["config.json", "*.safetensors", "README.md"]
 
+MOTION = (".npz", ".bvh", ".glb", ".fbx", ".csv")
+"""Suffixes of scenes, which are no checkpoints."""
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config")
 
 
@@ -138,6 +140,8 @@ def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]
     """
     if path.is_dir():
         return renamed_checkpoint(_read_folder(path, halves))
+    if path.suffix.lower() in MOTION and path.is_file():
+        raise ValueError(f"{path}: is a file of motion, expected a checkpoint, such as last.ckpt, or a model's name")
     try:
         mapped = mmap and zipfile.is_zipfile(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
@@ -193,6 +197,8 @@ def verify(path: Path) -> None:
     Raises:
         ValueError: they differ; says what to do.
     """
+    if path.is_dir():
+        return  # its parts have hashes of their own, which are checked as they are read
     beside = checksum_file(path)
     if path.is_file() and beside.is_file():
         match = re.match(r"[0-9a-f]{64}(?![0-9a-f])", beside.read_text(errors="replace", encoding="utf-8"))

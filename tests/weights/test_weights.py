@@ -9,6 +9,7 @@ import torch
 
 from magnet import checkpoints
 from magnet.files import CannotWrite
+from magnet.motion.scene import empty_scene
 from magnet.training.checkpoint_io import CheckpointIO
 
 
@@ -117,6 +118,17 @@ def test_a_damaged_configuration_is_named(change, checkpoint, tmp_path):
     (folder / "config.json").write_text(json.dumps(config | change))
     with pytest.raises(ValueError, match=r"config\.json is damaged"):
         checkpoints.read(folder)
+
+
+def test_a_file_of_motion_and_the_own_folder_are_no_checkpoints(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    empty_scene(1, 4, 2, torch.zeros(())).save(tmp_path / "duet.npz")
+    (tmp_path / "duet.csv").write_text("a_x,a_y,a_z\n")
+    for name in ("duet.npz", "duet.csv"):
+        with pytest.raises(ValueError, match=f"{name}: is a file of motion, expected a checkpoint"):
+            checkpoints.read(name)
+    with pytest.raises(ValueError, match="neither the folder of a released model"):
+        checkpoints.read(".")
 
 
 def test_no_name_is_no_checkpoint():
