@@ -67,6 +67,26 @@ def refused(command: str, said: str) -> str:
     return f"magnet {command}: error: {said}{stop} See magnet {command} --help"
 
 
+def plainly(message: str) -> str:
+    """argparse's sentence on the value of an option in our own words; any other as it is.
+
+    >>> plainly("argument --unit: invalid choice: 'mm' (choose from 'm', 'cm')")
+    '--unit: got mm, expected m or cm'
+    """
+    match = re.fullmatch(r"argument (?:-\w/)?(--[\w.]+): (.*)", message)
+    if match is None:
+        return message
+    flag, said = match.groups()
+    if number := re.fullmatch(r"invalid (int|float) value: '(.*)'", said):
+        return f"{flag}: got {number[2]}, expected {'a whole number' if number[1] == 'int' else 'a number'}"
+    if choice := re.fullmatch(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", said):
+        return f"{flag}: got {choice[1]}, expected {' or '.join(choice[2].replace(chr(39), '').split(', '))}"
+    if count := re.fullmatch(r"expected (one|at least one|\d+) arguments?", said):
+        what = "one value" if count[1] == "one" else f"{count[1]} value{'s' * (count[1].isdigit())}"
+        return f"{flag}: expected {what} behind it"
+    return message
+
+
 class PlainParser(argparse.ArgumentParser):
     """The parser of a command without a Trainer: nothing abbreviated, and a mistake in one line with what may be meant.
 
@@ -94,7 +114,7 @@ class PlainParser(argparse.ArgumentParser):
         name = unknown[1].partition("=")[0] if unknown else ""
         hint = closest(name, list(self._option_string_actions)) if unknown else ""
         hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
-        message = f"no option {name}" if unknown else message  # as the commands with a Trainer say it
+        message = f"no option {name}" if unknown else plainly(message)  # as the commands with a Trainer say it
         said = self.given
         several = [flag for each in self._actions if each.nargs == "+" for flag in each.option_strings if flag in said]
         if message.endswith("required: OUT") and several:

@@ -112,7 +112,11 @@ def test_skeleton_files_of_several_people_are_refined_as_well(crowded: Scene, tm
     ("words", "said"),
     [
         (("--keep", "7"), "people 0 to 1"),
-        (("--apart", "very"), "invalid choice"),
+        (("--apart", "very"), "error: --apart: got very, expected light or firm. See"),
+        (("--slides", "much"), "error: --slides: got much, expected a number. See"),
+        (("--keep", "1.5"), "error: --keep: got 1.5, expected a whole number. See"),
+        (("--plot",), "error: --plot: expected one value behind it. See"),
+        (("--shapes",), "error: --shapes: expected at least one value behind it. See"),
         (("--hands", "hold", "--apart", "light"), "firm"),
     ],
 )
