@@ -65,7 +65,9 @@ def main(arguments: Sequence[str]) -> int:
     # Intermixed, so that OUT may come after options: argparse would take it as left out once another came before them.
     known, rest = command_parser(command).parse_known_intermixed_args(words)
     if rest and not (command in ("prepare", "check") and all_reader_options(rest)):
-        raise ValueError(f"magnet data {command}: no option {rest[0]}; see magnet data {command} --help")
+        folder = "; the folder that is read is --root FOLDER" if command == "prepare" else ""
+        wrong = f"no option {rest[0]}" if rest[0].startswith("-") else f"got {rest[0]}, expected an option{folder}"
+        raise ValueError(f"magnet data {command}: {wrong}; see magnet data {command} --help")
     known.reader_options = rest
     return show_help(known) if known.help else int(known.run(known))
 
@@ -314,7 +316,7 @@ def run_prepare(given: argparse.Namespace) -> int:
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     show_gaps(m["splits"], "limit" in m)
     takes = sum(split["takes"] for split in m["splits"].values())
-    said = f"{takes} takes are in {out}; {len(m['skipped'])} were skipped."
+    said = f"{f'{takes} takes are' if takes != 1 else '1 take is'} in {out}; {len(m['skipped'])} were skipped."
     if why := why_untrained(m):
         print(f"{said} Nothing can be trained on it, for split train is empty: {why}")
         return 0

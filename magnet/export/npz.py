@@ -280,7 +280,8 @@ def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, s
     arrays = {"poses": poses, "transl": transl, "betas": betas} | ({} if own is None else {OWN_SHAPE: own})
     bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
     if bad or not 0 < fps < float("inf"):
-        raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
+        cut = "; cut frames without them out, as magnet data prepare does" if bad else ""
+        raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers{cut}")
     tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
     if given is not None:
         if given.dtype != bool or given.shape != poses.shape[:-1]:

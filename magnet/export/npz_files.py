@@ -106,7 +106,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
         require_own_rate(path, scene.fps, in_fps)
         if scene.body != body.id:
             raise ValueError(
-                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body"
+                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body FILE"
             )
         return NpzFile(scene, [], False, "y")
     scene, found = read_smplx(path, body, up, unit, in_fps)
@@ -115,6 +115,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
         note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
     if not ours and is_open(body):
         note.append(
-            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body"
+            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body FILE "
+            "names theirs"
         )
     return NpzFile(scene, note, not ours, found)

@@ -165,7 +165,7 @@ def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
     assert cli.main(["data", "check", "other", "--picture", "none"]) == 0
     said = capsys.readouterr().out
     wanted = "7 names of the lists are not in the download: gone0, gone1, gone2, gone3, gone4 and 2 more"
-    assert said.count(wanted) == 4
+    assert said.count(wanted) == 4 and "1 take is in other; 0 were skipped." in said
 
 
 def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(copy, capsys):
@@ -188,6 +188,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("prepare", "name is missing"),
         ("prepare dd100", "--root is missing (folder of the download, or of your own recordings)"),
         ("prepare interXX", "did you mean interx"),
+        ("prepare dd100 dl o", "got o, expected an option; the folder that is read is --root FOLDER"),
         ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
         ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
