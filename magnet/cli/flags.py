@@ -106,8 +106,12 @@ class PlainParser(argparse.ArgumentParser):
         self.given: list[str] = []
 
     def parse_known_intermixed_args(self, args: Any = None, namespace: Any = None) -> Any:
-        self.given = list(args or ())
-        return super().parse_known_intermixed_args(args, namespace)
+        self.given = []
+        for word in sys.argv[1:] if args is None else args:
+            if word in ("-x", "-y", "-z") and self.given and self.given[-1].startswith("--"):
+                word = f"{self.given.pop()}={word}"  # an axis, which argparse would take for an option
+            self.given.append(word)
+        return super().parse_known_intermixed_args(self.given, namespace)
 
     def error(self, message: str) -> NoReturn:
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)

@@ -328,6 +328,7 @@ def test_refine_refuses_what_means_nothing(
         (["--in_fps", "25"], "says 30 frames a second; --in_fps 25 is for files that say nothing"),
         (["--in_fps", "-1"], "in_fps"),
         (["--up", "q"], "up axis 'q' is for other programs' files"),
+        (["--up", "-z"], "up axis '-z' is for other programs' files"),
         (["--context", "-5"], "--context -5: expected 0 frames or more"),
         (["--context", "13"], "--context 13: got 12 frames, so at most 12 were given"),
     ],
