@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import re
 import sys
 from dataclasses import dataclass
@@ -64,7 +65,14 @@ def read_yaml(file: str) -> dict[str, Any]:
     path = Path(file)
     if not path.is_file():
         near = sorted(str(p) for p in path.parent.glob("[!.]*.yaml")) if path.parent.is_dir() else []
-        hint = f"; there are {', '.join(near)}" if near else ""
+        close = difflib.get_close_matches(path.stem, [Path(p).stem for p in near], n=1)
+        hint = (
+            f"; did you mean {path.with_name(close[0])}.yaml?"
+            if close
+            else f"; there are {', '.join(near)}"
+            if near
+            else ""
+        )
         if not near and path.parent.name == "configs":
             hint = "; configs/ is in a clone of the repository: run it there, or name the file's path in it"
         raise CommandError(f"no configuration file {file or '(none named)'}{hint}")

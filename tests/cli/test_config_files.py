@@ -170,6 +170,7 @@ def test_files_that_cannot_be_extended_are_told(toy: Path, capsys: pytest.Captur
     (toy / "odd.yaml").write_text("extends: {a: 1}\n")
     assert "extends itself, by way of one.yaml and two.yaml" in complaint(capsys, "fit", "--config", "one.yaml")
     assert "no configuration file nosuch.yaml" in complaint(capsys, "fit", "--config", "gone.yaml")
+    assert complaint(capsys, "fit", "--config", "oddd.yaml").endswith("oddd.yaml; did you mean odd.yaml?\n")
     assert "configs/ is in a clone of the repository" in complaint(capsys, "fit", "--config", "configs/finetune.yaml")
     assert "expected a file or a list of files" in complaint(capsys, "fit", "--config", "odd.yaml")
     Path("number.yaml").write_text("model: {class_path: 3}", encoding="utf-8")
