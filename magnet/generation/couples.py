@@ -7,8 +7,8 @@ from torch import Tensor
 
 from magnet.motion.scene import FPS
 
-LONG = 36
-"""Token steps after the last given one from which on people are led: shorter scenes are as the model made them."""
+LONG = 40
+"""Token steps after the last given one, over five seconds, beyond which people are led: up to there nobody is."""
 
 COUPLE = 96
 """Frames that two people must have been together to be a couple: who pass each other are none."""

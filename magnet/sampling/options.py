@@ -74,7 +74,7 @@ class SamplerOptions:
             live tasks from each token to the next. None: as the model is best sampled, or not.
         together: metres over the ground that couples stay within where scenes go on for long (ours,
             `magnet.generation.couples`): from three quarters of it on ways apart are shortened and people come slowly
-            back, in what is made more than 36 token steps after what was given; not in live tasks and crowds. 0: nobody
+            back, in what is made more than 40 token steps after what was given; not in live tasks and crowds. 0: nobody
             is led. None: as the model is best sampled, or 0.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
