@@ -6,12 +6,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
 # Everything here is tiny: a second thread only waits for the first, and badly so on a busy machine.
 torch.set_num_threads(1)
+
+# Machines may be busy: no test is about time.
+settings.register_profile("busy", deadline=None)
+settings.load_profile("busy")
 
 # What the tests' modules are made of stays to the end: to look for garbage in it again and again takes a tenth
 # of the time of all tests.
