@@ -43,7 +43,8 @@ class Gate:
     Attributes:
         taken: how many were.
         refused: how many were not, by the reason.
-        passed_over: how many were right in form and for somebody else: what who comes back is told of its own past.
+        passed_over: how many were right in form and of no use here: what somebody else who comes back is told of its
+            own past, and what oneself is told of a past that is long over.
         now: own frame, about which frames of others are taken; None: any.
     """
 
@@ -70,7 +71,7 @@ class Gate:
         try:
             message = unpack(parts)
             self._sent_by(message, at, peer)
-            if message.agent not in (message.sender, self.me):
+            if message.agent not in (message.sender, self.me) or self._over(message):
                 self.passed_over += 1
                 return None
             if message.model != self.model:  # who has other weights does not understand it
@@ -102,8 +103,14 @@ class Gate:
             first, last = message.frame, message.frame + len(message.poses) - 1
             if first < 0 or first // TOKEN != last // TOKEN:
                 raise RefusedMessage("frame")
-            if self.now is not None and not self.now - BEHIND <= first <= self.now + AHEAD:
+            if self.now is None or self._over(message):
+                return
+            if not self.now - BEHIND <= first <= self.now + AHEAD:
                 raise RefusedMessage("frame")
+
+    def _over(self, message: Message) -> bool:
+        """Whether these frames of oneself are long over: an answer to who comes back, later than its first token."""
+        return self.now is not None and message.agent == self.me and 0 <= message.frame < self.now - BEHIND
 
     def _numbers(self, message: Message) -> None:
         poses = message.poses

@@ -171,6 +171,15 @@ def test_what_is_told_somebody_else_of_its_past_is_neither_taken_nor_refused():
     assert ours.take(pack(dataclasses.replace(message(4000, token=False), agent="A")), 0.0, peer="B") is not None
 
 
+def test_what_is_told_oneself_of_a_past_that_is_long_over_is_neither_taken_nor_refused():
+    """Who comes back after ten seconds is told where it was; with many others, some tell it after its first token."""
+    ours = Gate(("A", "B", "C"), "A", "feed", LATENT)
+    ours.now = 428
+    told = dataclasses.replace(message(72, token=False), agent="A")
+    assert ours.take(pack(told), 0.0, peer="B") is None and (ours.passed_over, dict(ours.refused)) == (1, {})
+    assert ours.take(pack(message(72)), 0.0, peer="B") is None and dict(ours.refused) == {"frame": 1}
+
+
 def at(frame: int, x: float, count: int = 1, **fields) -> list[bytes]:
     """A message of somebody who stands at x metres."""
     sent = message(frame, count, token=False)

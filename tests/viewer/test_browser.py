@@ -99,16 +99,20 @@ def test_without_a_truth_there_are_no_ghosts_and_the_panel_says_so(page, panel, 
 def test_every_format_is_downloaded(page, panel, handshake, body, tmp_path) -> None:
     takes = [take("dance", handshake.slice(40, 64), 8)]
     begins = {"npz": b"PK", "bvh": b"PK", "glb": b"glTF", "csv": b"scene,frame", "gif": b"GIF8", "png": b"\x89PNG"}
-    begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00", "webp": b"RIFF"}
+    begins |= {"html": b"<!doctype html>", "mp4": b"\x00\x00\x00", "webp": b"RIFF", "vrma": b"PK"}
     files = {}
     with watched(page, takes, body, style="skeleton") as viewer:
         viewer.clock.playing = False
         page.get_by_text("Save", exact=True).click()
         for kind in FORMATS:
-            files[kind] = panel.downloaded(kind, f"dance.{'zip' if kind == 'bvh' else kind}", tmp_path)
+            name = f"dance.{'zip' if kind in ('bvh', 'vrma') else kind}"  # a file for each of two people
+            folder = tmp_path / kind
+            folder.mkdir()
+            files[kind] = panel.downloaded(kind, name, folder)
             assert files[kind].read_bytes().startswith(begins[kind]), kind
     assert Scene.load(files["npz"]).given.sum() == 16
-    assert zipfile.ZipFile(files["bvh"]).namelist() == ["scene_person0.bvh", "scene_person1.bvh"]
+    for kind in ("bvh", "vrma"):
+        assert zipfile.ZipFile(files[kind]).namelist() == [f"scene_person0.{kind}", f"scene_person1.{kind}"]
     page.goto(files["html"].as_uri())
     page.wait_for_function("window.player && player.drawn > 2")
     shot(page, "page_downloaded")
