@@ -22,6 +22,7 @@ from magnet.old_names import renamed_checkpoint
 from magnet.shared import digest, is_sharing, once
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.core import TokenizerCore
+from magnet.tokenizer.features import delta_known
 from magnet.tokenizer.lean import Growing, encoded, encoded_plainly
 from magnet.tokenizer.normalizer import Normalizer
 from magnet.tokenizer.raw import RawPose
@@ -177,14 +178,17 @@ class TokenModelCore(nn.Module):
         return self.normalizer.normalize(self.layout.pack(latent, deltas, pairs))
 
     def tokenize(self, scene: Scene) -> tuple[Tensor, Tensor]:
-        """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool."""
+        """Tokens in real units (B, N, P, D) and which groups of them count (B, N, P, 1 + slots) bool.
+
+        A token counts where its frames and the one before are valid: its first delta comes from there.
+        """
         scene = scene.pad_agents(self.layout.agents)
         latent = self._encoded(scene)
         with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
         if scene.valid is not None:
-            whole = scene.valid.unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
+            whole = delta_known(scene.valid).unflatten(1, (-1, TOKEN_FRAMES)).all(dim=-1)
             there = there & whole[:, :, None, None]
         return tokens, there
 

@@ -215,7 +215,8 @@ class CrowdRollout(Rollout):
         self.tokens[0][at] = torch.where(level[..., None] == 0, clean, noisy)
         if self.history is not None:
             self.history.clean[0][at] = clean
-            self.history.levels[at] = -1  # nothing has been predicted of this partner
+            cells = (at[0], at[1].cpu(), numbers.cpu())  # levels are planned on the CPU
+            self.history.levels[cells] = -1  # nothing has been predicted of this partner
         guess = self._guessed(stage.start, len(clean))
         guess[:, who[:, None], numbers] = clean
         self._guess, self._guess_at = guess, stage.start

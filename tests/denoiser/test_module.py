@@ -122,6 +122,21 @@ def test_statistics_make_training_tokens_standard(tmp_path):
         assert (~floored).sum() >= 3
 
 
+def test_what_a_gap_in_the_recording_says_is_learnt_by_nobody():
+    """Neither the gap, nor the step out of it, which is in the first delta of the token behind."""
+    model, scene = tiny_denoiser(), random_scene(2, 32, 2, torch.Generator().manual_seed(2))
+    valid = torch.ones(2, 32, dtype=torch.bool)
+    valid[1, 10:16] = False  # tokens 2 and 3
+    behind = scene.T_world_root.clone()
+    behind[1, 16:, :, 0, 3] += 5.0  # whoever was lost is found elsewhere
+    plain, there = model.tokenize(scene)
+    tokens, counted = model.tokenize(scene.replace(valid=valid, T_world_root=behind))
+    assert counted[1, :, 0, 0].tolist() == [True, True, False, False, False, True, True, True]
+    _, deltas, _ = model.layout.unpack(tokens - plain)
+    assert (deltas[1].abs().amax(dim=(1, 2, 3)) > 1).tolist() == [False] * 4 + [True] + [False] * 3
+    assert torch.equal(counted[0], there[0]) and counted[1, :2].equal(there[1, :2])
+
+
 def test_a_few_scenes_can_be_learnt(tmp_path):
     model = build(tmp_path, optimizer={"learning_rate": 3e-3}, network={"width": 64})
     fitted(model, 1)
