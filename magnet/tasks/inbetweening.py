@@ -25,7 +25,7 @@ class Inbetweening:
     Args:
         every: token steps from one keyframe to the next; 8 are about a second.
         keys: token steps that are keyframes; negative ones count from the end.
-        agents: slots that have keyframes; none named: everybody. The others are generated throughout.
+        agents: slots that have those of `every` or `keys`; none named: everybody. The others are generated throughout.
         pairs: single keyframes as (slot, token step), beside those of `keys`.
     """
 
@@ -50,7 +50,7 @@ class Inbetweening:
         """All keyframes as (agent, token step).
 
         Raises:
-            ValueError: no such agent or token step, or nothing is left to generate.
+            ValueError: no such agent or token step, agents beside nothing but pairs, or nothing is left to generate.
         """
         require_whole("every", self.every, 1)
         require_wholes("keys", self.keys)
@@ -59,6 +59,11 @@ class Inbetweening:
             require_wholes("pairs", pair, "(0, 8)")
             if len(pair) != 2:
                 raise ValueError(f"pairs: got {pair}, expected an agent's slot and a token step, such as (0, 8)")
+        if self.agents and self.pairs and not self.keys:
+            raise ValueError(
+                f"agents: got {tuple(self.agents)}, whose keyframes are those of keys, and only pairs are given; "
+                "leave agents out, or name keys"
+            )
         steps = self.keys
         if not self.keys and not self.pairs:
             steps = (*range(max(grid.context - 1, 0), grid.tokens, self.every), grid.tokens - 1)

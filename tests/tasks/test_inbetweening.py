@@ -96,6 +96,7 @@ def test_bad_keyframes_are_named():
     for task, message in [
         (Inbetweening(keys=(16,)), "token step 16: the grid has steps 0 to 15"),
         (Inbetweening(keys=(3,), agents=(2,)), "agent 2: the grid has agents 0 to 1"),
+        (Inbetweening(agents=(1,), pairs=((0, 4),)), "leave agents out, or name keys"),
         (Inbetweening(every=0), "at least 1"),
         (Inbetweening(every=1), "nothing to generate"),
     ]:
