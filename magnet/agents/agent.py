@@ -190,17 +190,20 @@ class Agent(Notebook):
         generator = torch.Generator(device=self.model.device).manual_seed(self.seed)
         self._go_on(self.start, -(self.start.frames // TOKEN), generator, None)
 
-    def join(self) -> None:
-        """Go on from what the others have told, where they are now; what is not known of oneself is held."""
-        stop = self.newest() + 1
+    def join(self, stop: int | None = None) -> None:
+        """Go on from what the others have told; what is not known of oneself is held.
+
+        stop: the next token; None: after the newest of anybody else.
+        """
+        stop = self.newest() + 1 if stop is None else stop
         missing = torch.zeros(PAST, len(self.names), dtype=torch.bool)
         people = []
         for slot in range(len(self.names)):
-            known = sorted(index for index in self.pieces[slot] if index < stop and self.come(slot, index))
+            known = sorted(index for index in self.pieces[slot] if self.come(slot, index))
             parts = []
             for row, index in enumerate(range(stop - PAST, stop)):
-                near = [each for each in known if each <= index] or known
-                piece = self.pieces[slot][near[-1] if near[0] <= index else near[0]]
+                near = max((each for each in known if each <= index), default=known[0])
+                piece = self.pieces[slot][near]
                 missing[row, slot] = index not in known
                 poses = piece.poses if index in known else np.repeat(piece.poses[-1:], TOKEN, axis=0)
                 if slot == self.me:
@@ -295,9 +298,9 @@ class Player(Notebook):
         """Play from the first frame."""
         self.next = 0
 
-    def join(self) -> None:
-        """Play from where the others are."""
-        self.next = self.newest() + 1
+    def join(self, stop: int | None = None) -> None:
+        """Play from where the others are. stop: see `Agent`"""
+        self.next = self.newest() + 1 if stop is None else stop
 
     def awaited(self) -> list[int]:
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections import Counter, deque
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from magnet.agents.agent import PAST, Member
-from magnet.agents.gate import Gate
+from magnet.agents.gate import GONE, Gate
 from magnet.agents.message import TOKEN, Message, pack
 from magnet.motion.scene import FPS
 
@@ -26,6 +27,8 @@ MOST = 0.005
 """Seconds that are taken up with each token, at most."""
 LOST = 1.0
 """Seconds behind after which one's own clock is set anew, and after which one goes on where the others are."""
+AWAY = GONE / FPS
+"""Seconds after which who has told nothing counts no longer."""
 
 
 class Channel(Protocol):
@@ -40,35 +43,49 @@ class Pace:
     """When tokens are due: so that all keep one pace though their clocks do not.
 
     Each agent compares how late after their time the others' tokens come with how late its own are sent, and moves
-    its clock a little towards their middle. No clock is ever read by another.
+    its clock a little towards the middle of all, or towards the other's where there is one. So one alone whose clock is
+    wrong moves nobody's in a group. No clock is ever read by another.
 
     Args:
         start: when token `first` is due, in seconds.
         first: a token.
+
+    Attributes:
+        lateness: of those who are heard, in seconds.
+        resets: how often the clock was set anew, being behind.
+        lost: seconds by which it was, together.
     """
 
     start: float
     first: int = 0
     lateness: dict[str, float] = field(default_factory=dict)
     resets: int = 0
+    lost: float = 0.0
+    _told: dict[str, float] = field(default_factory=dict, init=False, repr=False)
 
     def due(self, index: int) -> float:
         return self.start + (index - self.first) * PERIOD
+
+    def reached(self, at: float) -> int:
+        """The token that one would be at, had one never been late."""
+        return self.first + math.floor((at - self.start + self.lost) / PERIOD)
 
     def heard(self, name: str, index: int, at: float) -> None:
         """A token of somebody has come."""
         now = at - self.due(index)
         if abs(now) < LOST:
-            self.lateness[name] = 0.7 * self.lateness.get(name, now) + 0.3 * now
+            self.lateness[name], self._told[name] = 0.7 * self.lateness.get(name, now) + 0.3 * now, at
 
     def sent(self, index: int, at: float) -> float:
         """An own token has been sent. Returns by how much it was late."""
         late = at - self.due(index)
+        self.lateness = {name: each for name, each in self.lateness.items() if at - self._told[name] <= AWAY}
         if late > LOST:
-            self.start, self.resets = self.start + late, self.resets + 1
+            self.start, self.lost, self.resets = self.start + late, self.lost + late, self.resets + 1
             self.lateness.clear()
         elif self.lateness:
-            off = statistics.median(self.lateness.values()) - late
+            theirs = list(self.lateness.values())
+            off = statistics.median(theirs if len(theirs) == 1 else [*theirs, late]) - late
             self.start += max(-MOST, min(MOST, PULL * off))
         return late
 
@@ -147,7 +164,7 @@ class Process:
         self.report = Report(speed=speed)
         self._heard: set[str] = set()
         self._heard_by: set[str] = set()
-        self._running: set[str] = set()
+        self._running: dict[str, float] = {}  # who tells its frames, and when it last did
         self._answered: Counter[str] = Counter()
 
     def listen(self, seconds: float) -> None:
@@ -164,10 +181,13 @@ class Process:
                 if self.pace is not None:
                     self._answer(message, at)
                 continue
-            self._running.add(message.sender)
-            self.member.hear(message)
-            if self.pace is not None and message.agent == message.sender:
-                self.pace.heard(message.sender, message.frame // TOKEN, at)
+            if message.agent == message.sender:
+                self._running[message.sender] = at
+                self.member.hear(message)
+                if self.pace is not None:
+                    self.pace.heard(message.sender, message.frame // TOKEN, at)
+            elif self.pace is None:  # who has begun knows better where it is than others do
+                self.member.hear(message)
 
     def _answer(self, hello: Message, at: float) -> None:
         """Tell somebody who has come back how things are, at most every two seconds."""
@@ -198,10 +218,23 @@ class Process:
         member = self.member
         if self._running:
             self._gather(GATHER)
-            if member.newest() > 2 if self.real_time else any(map(self._far_on, self._running)):
-                member.join()
+            there, far = self._there(), sum(map(self._far_on, self._running))
+            if there > 2 if self.real_time else far >= min(2, len(self._running)):
+                member.join(there + 1)
                 self.report.joined = member.next
         self.pace = Pace(self.clock() + PERIOD, member.next)
+
+    def _there(self) -> int:
+        """The newest token that two have come to, of the others and the own clock; where one other tells, its own.
+
+        So one alone who runs ahead takes nobody along, and who is slow follows one who is on time.
+        """
+        now, member = self.clock(), self.member
+        told = [member.names.index(name) for name, at in self._running.items() if now - at <= AWAY]
+        come = sorted(last for slot in told if (last := member.last(slot)) >= 0)
+        if len(come) < 2:
+            return max(come, default=-1)
+        return max(come[-2], min(come[-1], -1 if self.pace is None else self.pace.reached(now)))
 
     def _far_on(self, name: str) -> bool:
         """Whether somebody's first tokens are no longer to be had."""
@@ -224,8 +257,8 @@ class Process:
         """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
         member, pace, cost = self.member, self.pace, statistics.median(self.report.took or [0.0])
         assert pace is not None
-        if self.real_time and (member.newest() - member.next) * PERIOD > LOST:
-            member.join()  # too slow for them all the time, or stopped for a while
+        if self.real_time and ((there := self._there()) - member.next) * PERIOD > LOST:
+            member.join(there + 1)  # too slow for them all the time, or stopped for a while
             pace = self.pace = Pace(self.clock() + PERIOD, member.next)
             self.report.jumps += 1
         index = member.next

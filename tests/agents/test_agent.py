@@ -212,6 +212,18 @@ def test_memory_does_not_grow(denoiser, start):
     assert agents[0].next == 226 and np.isfinite(agents[0].step().poses).all()
 
 
+def test_who_joins_behind_somebody_of_whom_nothing_else_is_kept_holds_them_there(denoiser, start):
+    """C runs ahead of all: of it only what is to come is known."""
+    agent = Agent(denoiser, start, NAMES, "A", AgenticSync(), REFERENCE, seed=1)
+    told = agent.step()
+    agent.hear(replace(told, agent="C", sender="C", frame=4 * 74))
+    agent.next = 70
+    agent.forget()
+    assert agent.last(2) == 74 and not agent.come(2, -1)
+    agent.join(70)
+    assert agent.next == 70 and np.isfinite(agent.step().poses).all()
+
+
 def test_what_cannot_be_is_named(denoiser, start):
     with pytest.raises(ValueError, match="a name for each slot"):
         Agent(denoiser, start, ("A", "B"), "A", AgenticSync())

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from magnet.agents.agent import Player
 from magnet.agents.gate import Gate
 from magnet.agents.message import Message, pack, unpack
-from magnet.agents.run import LOST, PERIOD, Pace, Process
+from magnet.agents.run import AWAY, LOST, PERIOD, Pace, Process
 from magnet.testing import random_scene
 
 
@@ -27,7 +29,7 @@ def drifting(rates: list[float], tokens: int, pull: bool = True) -> list[list[fl
     return sent
 
 
-@pytest.mark.parametrize("rates", [[1.0, 1.01], [0.99, 1.0, 1.005, 1.01]])
+@pytest.mark.parametrize("rates", [[1.0, 1.01], [0.99, 1.0, 1.01], [1.0, 1.0, 1.01], [0.99, 1.0, 1.005, 1.01]])
 def test_agents_keep_one_pace_though_their_clocks_drift(rates):
     """Two minutes: clocks a percent apart would be a second apart; together they stay within a token."""
     tokens = round(120 / PERIOD)
@@ -44,6 +46,25 @@ def test_who_is_far_behind_sets_its_clock_anew():
     assert pace.resets == 1 and pace.due(1) == pytest.approx(2 * LOST + PERIOD)
     pace.heard("B", 1, pace.due(1) + 5 * LOST)  # somebody else who is far behind is not waited for
     assert not pace.lateness
+
+
+@pytest.mark.parametrize("others", [2, 3, 4])
+def test_one_whose_clock_is_wrong_moves_nobody_elses_in_a_group(others):
+    """It is half a second early, whatever the others do."""
+    pace = Pace(0.0)
+    for index in range(100):
+        at = pace.due(index)
+        for other in range(others):
+            pace.heard(str(other), index, at - 0.5 * (other == 0))
+        pace.sent(index, at)
+    assert pace.start == pytest.approx(0.0, abs=1e-9)
+
+
+def test_who_is_gone_moves_nobodys_clock_any_more():
+    pace = Pace(0.0)
+    pace.heard("B", 0, 0.5)
+    moved = [pace.start for index in range(100) if pace.sent(index, pace.due(index)) is not None]
+    assert moved[10] > 0 and moved[-1] == moved[20] and not pace.lateness
 
 
 class Line:
@@ -92,6 +113,88 @@ def test_who_has_fallen_behind_goes_on_where_the_others_are():
     assert process.turn()
     assert member.next == 61 and process.report.jumps == 1
     assert process.turn() and process.report.jumps == 1
+
+
+def told(name: str, index: int, **fields) -> tuple[str, list[bytes]]:
+    """A token of A or C, who stand beside B all the time."""
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (400, 1)))
+    member = Player(recording, start, "ABC", name)
+    member.next = index
+    message = member.step()
+    assert message is not None
+    return name, pack(dataclasses.replace(message, **fields))
+
+
+def third(line: Line) -> tuple[Process, Player]:
+    """B, who plays a recording with A and C."""
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (400, 1)))
+    member = Player(recording, start, "ABC", "B")
+    gate = Gate("ABC", "B", "", 0, 1e9, 1e9)
+    return Process(member, line, gate, {"A", "C"}, clock=lambda: line.now, session=1), member
+
+
+def begun() -> tuple[Line, Process, Player]:
+    """B, who has told a token with nobody there yet."""
+    line = Line([])
+    process, member = third(line)
+    process.meet = 0.0
+    process.begin()
+    assert process.turn() and member.next == 1
+    return line, process, member
+
+
+def hears(line: Line, process: Process, *coming: tuple[str, list[bytes]]) -> None:
+    line.coming += coming
+    while line.coming:
+        process.listen(0.0)
+
+
+def test_one_alone_who_runs_ahead_takes_nobody_along_in_a_group():
+    line, process, member = begun()
+    hears(line, process, told("A", 60), told("C", 1))
+    assert process.turn() and member.next == 2 and process.report.jumps == 0
+    hears(line, process, told("A", 70), told("C", 40))
+    assert process.turn() and member.next == 42 and process.report.jumps == 1, "behind all others: where two are"
+
+
+def test_who_is_left_with_one_other_goes_with_them():
+    line, process, member = begun()
+    hears(line, process, told("A", 60), told("C", 1))
+    line.now += AWAY + 0.1
+    hears(line, process, told("A", 61))
+    assert process.turn() and member.next == 63 and process.report.jumps == 1
+
+
+def test_who_is_slow_goes_on_with_who_is_on_time_though_another_is_slow_too():
+    """A person in a headset, and two agents on one slow machine: their own clocks say that the person is right."""
+    line, process, member = begun()
+    for index in range(1, 30):
+        line.now += 0.2  # what a token takes
+        hears(line, process, told("A", int(line.now / PERIOD)), told("C", index))
+        process.turn()
+        if process.report.jumps:
+            break
+    assert 12 < index < 29 and member.next - 1 == pytest.approx(line.now / PERIOD, abs=2)
+    hears(line, process, told("A", 90), told("C", member.next))
+    next_, _ = member.next, process.turn()
+    assert member.next == next_ + 1, "and no further than that"
+
+
+def test_who_comes_back_joins_where_two_are():
+    line = Line([told("A", 90), told("C", 30)])
+    process, member = third(line)
+    process.begin()
+    assert process.report.joined == member.next == 31
+
+
+def test_what_others_tell_of_oneself_counts_only_until_one_has_begun():
+    """Else anybody says where one is, for when one goes on where the others are."""
+    line = Line([told("A", 30), told("A", 29, agent="B")])
+    process, member = third(line)
+    process.begin()
+    assert process.report.joined == 31 and member.come(1, 29)
+    hears(line, process, told("A", 40, agent="B"))
+    assert not member.come(1, 40) and process.gate.taken == 3
 
 
 def test_where_the_clock_runs_slower_tokens_are_due_later_and_nothing_else_changes():
