@@ -23,6 +23,8 @@ TOKEN = 4
 """Frames of a token."""
 PLACED = TOKEN * 16
 """Numbers of a token after its latent: four canonical frames."""
+PARTS = 5
+"""Parts of a message."""
 LARGEST = 65536
 """Bytes of a message, at most."""
 HEADER = 2048
@@ -93,7 +95,7 @@ def unpack(parts: Sequence[bytes]) -> Message:
     Raises:
         RefusedMessage: anything else.
     """
-    if len(parts) != 5 or sum(map(len, parts)) > LARGEST or len(parts[1]) > HEADER:
+    if len(parts) != PARTS or sum(map(len, parts)) > LARGEST or len(parts[1]) > HEADER:
         raise RefusedMessage("size")
     if sealed(parts[:4])[4] != parts[4]:
         raise RefusedMessage("checksum")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from magnet.agents.message import LARGEST, VERSION
+from magnet.agents.message import LARGEST, PARTS, VERSION
 
 QUEUE = 64
 """Messages that wait for somebody who does not read; after that they are lost."""
@@ -86,6 +86,7 @@ class Link:
         self.poller = zmq.Poller()
         self.inn: dict[Any, tuple[str, str]] = {}  # sockets, and of whom and where they hear
         self._last: dict[Any, float] = {}
+        self._begun: dict[Any, list[bytes]] = {}  # messages that are not read to their ends yet
         for other, address in connect.items():
             socket = self.context.socket(zmq.SUB)
             socket.set_hwm(QUEUE)
@@ -97,24 +98,36 @@ class Link:
             socket.subscribe(b"magnet/")
             socket.connect(address)
             self.poller.register(socket, zmq.POLLIN)
-            self.inn[socket], self._last[socket] = (other, address), time.monotonic()
+            self.inn[socket], self._last[socket], self._begun[socket] = (other, address), time.monotonic(), []
 
     def send(self, parts: list[bytes]) -> None:
         """Tell all who listen; never waits."""
         self.out.send_multipart(parts)
 
     def receive(self, seconds: float) -> list[tuple[str, list[bytes]]]:
-        """Messages that have arrived, each with its sender's name; waits for the first at most so long."""
+        """Messages that have arrived, each with its sender's name; waits for the first at most so long.
+
+        Of a message of more parts than any has, one part more is given: enough to refuse it.
+        """
         found = []
         for socket, _ in self.poller.poll(max(int(1000 * seconds), 0)):
-            for _ in range(QUEUE):
-                try:
-                    found.append((self.inn[socket][0], socket.recv_multipart(self._zmq.NOBLOCK)))
-                except self._zmq.Again:
-                    break
+            found += [(self.inn[socket][0], parts) for parts in self._read(socket)]
             self._last[socket] = time.monotonic()
         self._renew()
         return found
+
+    def _read(self, socket: Any) -> Iterator[list[bytes]]:
+        """What has come whole, part by part: a message of a million parts takes seconds, and is read in many turns."""
+        for _ in range(QUEUE * PARTS):
+            try:
+                part = socket.recv(self._zmq.NOBLOCK)
+            except self._zmq.Again:
+                return
+            if len(self._begun[socket]) <= PARTS:
+                self._begun[socket].append(part)
+            if not socket.getsockopt(self._zmq.RCVMORE):
+                parts, self._begun[socket] = self._begun[socket], []
+                yield parts
 
     def _renew(self) -> None:
         """Connect anew to who is silent: after one message over its size ZeroMQ hears nothing of an address again."""

@@ -280,6 +280,28 @@ def test_who_sent_a_message_over_the_size_is_heard_again(monkeypatch: pytest.Mon
     context.destroy(linger=0)
 
 
+def test_a_message_of_very_many_parts_is_read_in_many_turns_and_not_kept() -> None:
+    """Else who reads it does nothing else until its end."""
+    zmq, addresses = engine(), addresses_of("AB")
+    link = Link("A", addresses["A"], {"B": addresses["B"]})
+    context = zmq.Context()
+    out = context.socket(zmq.PUB)
+    out.bind(addresses["B"])
+    turns, heard, end = 0, [], time.monotonic() + 20
+    while not heard and time.monotonic() < end:
+        out.send_multipart([b"magnet/B", b"hello"])
+        heard = link.receive(0.05)
+    out.send_multipart([b"magnet/B", *[b"x"] * 20_000])
+    out.send_multipart([b"magnet/B", b"after"])
+    while heard[-1][1][-1] != b"after" and time.monotonic() < end:
+        heard += link.receive(0.05)
+        turns += 1
+    assert turns > 50 and heard[-1] == ("B", [b"magnet/B", b"after"])
+    assert len(heard[-2][1]) == 6, "as many as are refused"
+    link.close()
+    context.destroy(linger=0)
+
+
 def relayed(stop: threading.Event, source: str, address: str, lossy: Lossy) -> None:
     """Hand on what an agent tells, but for what a bad line loses, makes late and reorders; a turn is 30 ms."""
     zmq = engine()
