@@ -19,6 +19,8 @@ FASTEST = 1.6
 """Metres a second that steering may ask of somebody."""
 HURRIED = 3.0
 """Metres a second above which a keyframe is reported as too far away."""
+LATER = 9000
+"""Frames, five minutes, that a keyframe may lie behind the end of a scene, at most: all up to it is made at once."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,19 @@ def keyframe(scene: Scene, agent: int, frame: int, pose: int | None = None, held
         scene.body_rot[0, frames, agent].cpu(),
         inverse(T_world_can[pose]) @ own[frames, 0],
     )
+
+
+def require_soon(frame: float, frames: int) -> None:
+    """Refuse a keyframe whose frame lies too far behind the end of a scene of so many frames.
+
+    Raises:
+        ValueError: it does.
+    """
+    if not frame <= frames + LATER:
+        raise ValueError(
+            f"a keyframe at frame {frame:.0f}: all up to the last keyframe is made at once, so it lies at frame "
+            f"{frames + LATER} or earlier, {LATER} after the end of the scene"
+        )
 
 
 def limb_places(key: Keyframe, limb: str, body: Body, betas: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_given
-from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, with_keyframes
+from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, require_soon, with_keyframes
 from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.partner import Partner
 from magnet.generation.plan import plan_of_scene
@@ -259,7 +259,8 @@ class Live:
         """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
 
         Raises:
-            ValueError: there are no keyframes, or one lies where nothing comes before it.
+            ValueError: there are no keyframes, or one lies where nothing comes before it, or over five minutes
+                (`LATER`) after the end.
         """
         begun = time.perf_counter()
         with self.lock:
@@ -287,6 +288,7 @@ class Live:
                 f"a keyframe at frame {first}: the model goes on from {CONTEXT} frames, so the first keyframe lies at "
                 f"{CONTEXT + TOKEN_FRAMES} or later"
             )
+        require_soon(max(key.frame for key in self.keys), self.scene.frames)
         return max(CONTEXT, min(self.scene.frames, first - REACH) // TOKEN_FRAMES * TOKEN_FRAMES)
 
     def _append(self, scene: Scene, chunk: Scene, version: int, begun: float, anew: bool = False) -> LiveChunk:

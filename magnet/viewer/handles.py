@@ -16,11 +16,13 @@ from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import bone_poses
 from magnet.generation.keyframes import (
     HURRIED,
+    LATER,
     Goal,
     Keyframe,
     keyframe,
     limb_places,
     pace,
+    require_soon,
     speeds,
     with_keyframes,
     with_limb,
@@ -144,7 +146,8 @@ class KeyframePanel:
             )
             add = gui.add_button("Add keyframe here", icon="plus")
             self.which = gui.add_dropdown("keyframe", (NO_KEYS,))
-            self.at = gui.add_number("at frame", 0, min=0, step=4, hint="later than the last frame there is, too")
+            hint = f"later than the last frame there is, too, by {LATER} at most"
+            self.at = gui.add_number("at frame", 0, min=0, step=4, hint=hint)
             self.limb = LimbHandle(app.server, app.body, self._chosen_key, self._bent)
             remove = gui.add_button("Remove this keyframe", icon="minus")
             self.list = gui.add_markdown("")
@@ -212,7 +215,16 @@ class KeyframePanel:
         entry = self._chosen()
         if event.client_id is None or entry is None:  # by the panel itself
             return
-        frame = max(int(self.at.value), 0) // 4 * 4
+        self._told(event.client, lambda: self._put_at(entry, self.at.value))
+
+    def _put_at(self, entry: KeyframeEntry, wanted: float) -> None:
+        """Move a keyframe in time, unless there is one of that time."""
+        try:
+            require_soon(wanted, self.live.scene.frames)
+        except ValueError:
+            self.at.value = entry.key.frame
+            raise
+        frame = max(int(wanted), 0) // 4 * 4
         taken = any(e is not entry and (e.key.agent, e.key.frame) == (entry.key.agent, frame) for e in self.entries)
         if frame != entry.key.frame and not taken:
             self._change(entry, frame=frame)

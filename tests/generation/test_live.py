@@ -287,6 +287,9 @@ def test_keyframes_where_they_cannot_be_are_refused(live: Live) -> None:
     live.keys = [keyframe(live.scene, 0, 33)]
     with pytest.raises(ValueError, match=r"a keyframe at frame 32: .* lies at 36 or later"):
         live.between()
+    live.keys = [dataclasses.replace(keyframe(live.scene, 0, 60), frame=10**12), keyframe(live.scene, 0, 60)]
+    with pytest.raises(ValueError, match=r"a keyframe at frame 1000000000000: .* lies at frame 9064 or earlier"):
+        live.between()
     with pytest.raises(ValueError, match="person 3 is not there: the scene has 2"):
         keyframe(live.scene, 2, 40)
     with pytest.raises(ValueError, match="with the pose of frame 99: the scene has frames 0 to 63"):

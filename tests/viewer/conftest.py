@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from magnet.body import Body, load_body
+from magnet.generation.live import Live
 from magnet.motion.scene import Scene
 from magnet.synthesis.generate import synthesize
-from magnet.testing import random_scene
+from magnet.testing import random_scene, tiny_denoiser
 from magnet.viewer.server import start
 from tests.viewer.browser import Panel
 
@@ -48,6 +49,20 @@ def server() -> Iterator[Any]:
     server = start("127.0.0.1", 0, "test")
     yield server
     server.stop()
+
+
+@pytest.fixture
+def app(body: Body, handshake: Scene) -> Iterator[Any]:
+    """The live viewer of a small model, that goes on from 64 frames of two people; nobody looks."""
+    pytest.importorskip("viser")
+    from magnet.viewer.live_app import LiveApp
+
+    model = tiny_denoiser(max_agents=2, window=16)
+    live = Live(model, start=handshake.slice(0, 64), generator=torch.Generator().manual_seed(1))
+    live.settings.steps = 2
+    app = LiveApp(live, body, port=0)
+    yield app
+    app.stop()
 
 
 @pytest.fixture(scope="module")

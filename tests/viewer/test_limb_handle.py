@@ -4,28 +4,11 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import pytest
 import torch
 
 from magnet.body import Body
 from magnet.body.reach import LIMBS
 from magnet.generation.keyframes import keyframe, limb_places
-from magnet.generation.live import Live
-from magnet.motion.scene import Scene
-from magnet.testing import tiny_denoiser
-
-
-@pytest.fixture
-def app(body: Body, handshake: Scene):
-    pytest.importorskip("viser")
-    from magnet.viewer.live_app import LiveApp
-
-    model = tiny_denoiser(max_agents=2, window=16)
-    live = Live(model, start=handshake.slice(0, 64), generator=torch.Generator().manual_seed(1))
-    live.settings.steps = 2
-    app = LiveApp(live, body, port=0)
-    yield app
-    app.stop()
 
 
 def test_a_limb_of_a_keyframe_isdragged_by_its_arrows_and_what_is_generated_has_it_there(app, body: Body) -> None:
