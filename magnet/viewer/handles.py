@@ -207,9 +207,9 @@ class KeyframePanel:
         self._listed()
 
     def _drop(self, entry: KeyframeEntry) -> None:
-        entry.handle.remove()
-        entry.preview.show(False)
         self.entries = [each for each in self.entries if each is not entry]
+        entry.handle.remove()
+        entry.preview.remove()
 
     def _moved_in_time(self, event: Any) -> None:
         entry = self._chosen()
@@ -254,6 +254,8 @@ class KeyframePanel:
             self._change(entry, body_rot=key.body_rot)
 
     def _change(self, entry: KeyframeEntry, **changes: Any) -> None:
+        if all(each is not entry for each in self.entries):  # dragged by one browser, removed by another
+            return
         entry.key = dataclasses.replace(entry.key, **changes)
         self._pose(entry)
         self._tell()

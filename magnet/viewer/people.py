@@ -38,6 +38,9 @@ class PeopleView(Protocol):
     def show(self, on: bool) -> None:
         """Hide or show everybody; hidden people need no poses."""
 
+    def remove(self) -> None:
+        """Take everybody out of the scene, or hide them where the browser cannot take them out."""
+
 
 def add_people(
     server: Any, name: str, body: Body, scene: Scene, style: Style, colours: Colours, opacity: float | None = None
@@ -83,9 +86,11 @@ class SkinnedPeople:
         self.colours = colours.copy()
 
     def show(self, on: bool) -> None:
-        # Hidden, never removed: viser 1.1's browser part fails while it takes a skinned mesh apart.
         for mesh in self.meshes:
             mesh.visible = on
+
+    def remove(self) -> None:
+        self.show(False)  # viser 1.1's browser part fails while it takes a skinned mesh apart
 
 
 def poser(mesh: Any) -> Poser:
@@ -133,6 +138,7 @@ class LimbPeople:
         length = np.linalg.norm(end - start, axis=-1)  # (P, M)
         turns, places = stand(start, end)
         self.colours = colours.copy()
+        self.root = server.scene.add_frame(name, show_axes=False)
         self.batches = []
         sectors, rings = COARSE if len(rest) > MANY else FINE
         for m in range(len(table)):
@@ -169,8 +175,10 @@ class LimbPeople:
         self.colours = colours.copy()
 
     def show(self, on: bool) -> None:
-        for batch in self.batches:
-            batch.visible = on
+        self.root.visible = on
+
+    def remove(self) -> None:
+        self.root.remove()  # and the batches below it
 
 
 def stand(start: Array, end: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
