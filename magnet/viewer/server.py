@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http
 import ipaddress
 import os
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -19,6 +20,8 @@ TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
 Else it moves the bones of bodies in the picture that is about to be drawn, and colours and marks in the one after it:
 where no GPU draws, bodies were ahead of their colours and marks by a tenth of a second and more.
 """
+GRACE = 0.5
+"""Seconds that browsers have to say goodbye when a server stops: one whose connection is cut never does."""
 NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
@@ -69,23 +72,36 @@ def is_foreign(origin: str | None, asked: str, local: bool) -> bool:
 
 @contextlib.contextmanager
 def own_pages_only(local: bool) -> Iterator[None]:
-    """Servers of viser that are started within answer only their own pages, which viser does not see to.
+    """Servers of viser that are started within answer only their own pages, which viser does not see to, and end soon.
 
     Raises:
         ImportError: viser has started none in the way that is known.
     """
     from websockets.asyncio import server as sockets
+    from websockets.protocol import State
 
     serve, guarded = sockets.serve, []
 
-    def guard(*where: Any, process_request: Any, **options: Any) -> Any:
+    @contextlib.asynccontextmanager
+    async def guard(*where: Any, process_request: Any, **options: Any) -> AsyncIterator[Any]:
         def answer(connection: Any, request: Any) -> Any:
             if is_foreign(request.headers.get("Origin"), request.headers.get("Host", ""), local):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "this viewer answers only its own pages\n")
             return process_request(connection, request)
 
         guarded.append(True)
-        return serve(*where, process_request=answer, **options)
+        async with serve(*where, process_request=answer, **options) as server:
+            try:
+                yield server
+            finally:
+                asyncio.get_running_loop().call_later(GRACE, cut, server)
+
+    def cut(server: Any) -> None:
+        for connection, handler in tuple(server.handlers.items()):
+            if connection.state is State.CONNECTING:  # it has asked for nothing yet, as browsers do to be quicker later
+                handler.cancel()
+            else:
+                connection.transport.abort()
 
     sockets.serve = guard  # type: ignore[assignment, misc]
     try:

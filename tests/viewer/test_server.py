@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import http.client
+import socket
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +20,7 @@ from magnet.export.page.takes import take
 from magnet.motion.scene import Scene
 from magnet.viewer.base import has_picture
 from magnet.viewer.saving import saved
-from magnet.viewer.server import is_foreign, is_local, own_pages_only
+from magnet.viewer.server import is_foreign, is_local, own_pages_only, start
 
 HERE, EVERYWHERE = True, False
 
@@ -77,6 +80,38 @@ def test_a_page_of_another_server_is_neither_told_nor_heard(server: Any) -> None
         page.request("GET", "/", headers={"Host": host})
         assert page.getresponse().status == status
         page.close()
+
+
+ASKS = (
+    "GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    "Sec-WebSocket-Protocol: viser-v{version}\r\n\r\n"
+)
+
+
+@pytest.mark.parametrize("kind", ["asks for nothing", "says no goodbye", "reads nothing"])
+def test_a_server_stops_soon_and_wholly_though_a_browser_no_longer_answers(
+    kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its connection was cut, its machine sleeps, or its page stands still."""
+    viser = pytest.importorskip("viser")
+    before = set(threading.enumerate())
+    server = start("127.0.0.1", 0, "test")
+    with socket.create_connection(("127.0.0.1", server.get_port()), 20) as browser:
+        if kind != "asks for nothing":
+            browser.sendall(ASKS.format(port=server.get_port(), version=viser.__version__).encode())
+            assert browser.recv(12) == b"HTTP/1.1 101"
+        if kind == "reads nothing":  # more than the network holds
+            points = np.zeros((1_000_000, 3), np.float32)
+            server.scene.add_point_cloud("/many", points, points.astype(np.uint8))
+        time.sleep(0.5)
+        begun = time.monotonic()
+        server.stop()
+        assert time.monotonic() - begun < 4.0
+        while set(threading.enumerate()) - before and time.monotonic() - begun < 4.0:
+            time.sleep(0.05)
+        assert not set(threading.enumerate()) - before
+    assert not caplog.records
 
 
 def test_a_viser_that_starts_otherwise_is_refused_and_not_left_open() -> None:
