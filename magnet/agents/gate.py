@@ -46,6 +46,7 @@ class Gate:
         passed_over: how many were right in form and of no use here: what somebody else who comes back is told of its
             own past, and what oneself is told of a past that is long over.
         now: own frame, about which frames of others are taken; None: any.
+        due: own frame by one's own clock, about which they are taken too: who was stopped is behind it.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class Gate:
         self.rate, self.burst = rate, burst
         self.taken, self.passed_over, self.refused = 0, 0, Counter[str]()
         self.now: int | None = None
+        self.due = 0
         self._sessions: dict[str, tuple[int, float]] = {}  # whose newest process that is, and when it was last heard
         self._left: dict[str, tuple[float, float]] = {}  # messages that a sender may send still, and since when
         # Where whose pelvis was by whom, by frame. What one sender tells of another binds nobody else.
@@ -105,7 +107,7 @@ class Gate:
                 raise RefusedMessage("frame")
             if self.now is None or self._over(message):
                 return
-            if not self.now - BEHIND <= first <= self.now + AHEAD:
+            if not self.now - BEHIND <= first <= max(self.now, self.due) + AHEAD:
                 raise RefusedMessage("frame")
 
     def _over(self, message: Message) -> bool:

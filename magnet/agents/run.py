@@ -262,7 +262,7 @@ class Process:
             pace = self.pace = Pace(self.clock() + PERIOD, member.next)
             self.report.jumps += 1
         index = member.next
-        self.gate.now = index * TOKEN
+        self.gate.now, self.gate.due = index * TOKEN, pace.reached(self.clock()) * TOKEN if self.real_time else 0
         given_up = self.clock() + self.patience
         while True:
             now = self.clock()

@@ -117,7 +117,7 @@ def test_who_has_fallen_behind_goes_on_where_the_others_are():
 
 def told(name: str, index: int, **fields) -> tuple[str, list[bytes]]:
     """A token of A or C, who stand beside B all the time."""
-    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (400, 1)))
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (800, 1)))
     member = Player(recording, start, "ABC", name)
     member.next = index
     message = member.step()
@@ -127,7 +127,7 @@ def told(name: str, index: int, **fields) -> tuple[str, list[bytes]]:
 
 def third(line: Line) -> tuple[Process, Player]:
     """B, who plays a recording with A and C."""
-    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (400, 1)))
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 3), (800, 1)))
     member = Player(recording, start, "ABC", "B")
     gate = Gate("ABC", "B", "", 0, 1e9, 1e9)
     return Process(member, line, gate, {"A", "C"}, clock=lambda: line.now, session=1), member
@@ -178,6 +178,19 @@ def test_who_is_slow_goes_on_with_who_is_on_time_though_another_is_slow_too():
     hears(line, process, told("A", 90), told("C", member.next))
     next_, _ = member.next, process.turn()
     assert member.next == next_ + 1, "and no further than that"
+
+
+def test_who_was_stopped_for_longer_than_frames_are_taken_ahead_goes_on_where_the_others_are():
+    line, process, member = begun()
+    line.now += 20.0
+    hears(line, process, told("A", 150), told("C", 150))
+    assert process.turn() and process.gate.refused == {"frame": 2}, "only now it looks at its clock"
+    hears(line, process, told("A", 151), told("C", 151))
+    assert process.turn() and member.next == 153 and process.report.jumps == 1
+    hears(line, process, told("A", 199))
+    assert process.turn() and member.next == 154
+    hears(line, process, told("A", 199, frame=4 * 240))
+    assert process.gate.refused == {"frame": 3}, "what is ahead of one's clock is refused as ever"
 
 
 def test_who_comes_back_joins_where_two_are():
