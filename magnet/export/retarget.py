@@ -20,6 +20,7 @@ from magnet.body.joints import (  # isort: skip
     PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
 )  # fmt: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
+from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, people_of, understood_together
@@ -206,9 +207,10 @@ def _jumps(skeleton: Skeleton) -> tuple[int, ...]:
 def _exact(skeleton: Skeleton, body: Body) -> tuple[Scene, Source] | None:
     """The scene of a skeleton with our names, tree and a shape that the body can take; None for any other."""
     file = skeleton.file
-    if not set(JOINT_NAMES) <= set(file.names):
+    names = bone_names("vrm" if file.path.suffix.lower() == ".vrma" else "smplx")  # whose format names bones by roles
+    if not set(names) <= set(file.names):
         return None
-    number = [file.names.index(name) for name in JOINT_NAMES]
+    number = [file.names.index(name) for name in names]
     if any(file.parents[number[j]] != number[PARENTS[j]] for j in range(1, BODY_JOINTS)):
         return None
     Q = np.round(skeleton.R_rest_ours)  # ours rest along the axes, however far a shape leans

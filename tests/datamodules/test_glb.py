@@ -115,15 +115,16 @@ def test_a_folder_that_holds_bvh_too_is_not_read_as_both(
 # -- what they are taken for -------------------------------------------------------------------
 
 
-def test_what_we_wrote_comes_back_exactly_from_a_store(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("suffix", "label"), [(".glb", "person_"), (".vrma", "person")])
+def test_what_we_wrote_comes_back_exactly_from_a_store(suffix: str, label: str, tmp_path: Path) -> None:
     body, scene = load_body(), duet()
     (tmp_path / "dl").mkdir()
-    save_glb(scene, tmp_path / "dl/duet.glb", body)
+    write(scene, tmp_path / f"dl/duet{suffix}")
     options = CanonicalizeOptions(min_frames=4, trust_fps=True)
     job = PrepareJob("glb", str(tmp_path / "dl"), {"split": "scenes"}, "open", options)
     manifest = prepare(job, tmp_path / "store").folder.manifest
     assert manifest["skipped"] == []
-    assert [entry["persons"] for entry in manifest["persons"]] == [["person_0", "person_1"]]
+    assert [entry["persons"] for entry in manifest["persons"]] == [[f"{label}0", f"{label}1"]]
     assert any("mean residual 0.0 cm" in entry["note"] for entry in manifest["notes"])
     store = Prepared(path=str(tmp_path / "store"), body_model="open").open_store("train")
     found = store.gather(recorded_windows(store, [(0, 0)]), 64)

@@ -22,6 +22,7 @@ from magnet.export.onto_rig import save_onto
 from magnet.export.reading import Reading, read
 from magnet.motion.rotations import from_quat
 from magnet.motion.scene import Scene
+from magnet.testing import random_scene
 from tests.export import glb_strangers
 from tests.export.test_glb_read import off, stranger
 from tests.export.test_onto_rig import someone
@@ -157,6 +158,15 @@ def test_a_vrm_animation_holds_what_its_specification_asks_for(couple: Scene, bo
 def test_vrm_animations_are_read_as_people_of_one_world(couple: Scene, body: Body, tmp_path: Path) -> None:
     got = read(formats.write(couple, tmp_path / "dance.vrma", body), options=Reading(keep_floor=True))
     assert got.scene.agents == 2 and off(got.scene, couple, body) < 0.015
+
+
+def test_vrm_animations_of_any_shape_come_back_exactly(body: Body, tmp_path: Path) -> None:
+    """Also where people stand over the floor, as whoever is fitted would not."""
+    couple = random_scene(1, 12, 2, torch.Generator().manual_seed(4))
+    got = read(formats.write(couple, tmp_path / "dance.vrma", body))
+    assert got.scene.agents == 2 and off(got.scene, couple, body) < 1e-5
+    assert [note for note in got.notes if "the body's own skeleton" not in note] == []
+    assert torch.allclose(got.scene.betas, couple.betas, atol=1e-3)
 
 
 def test_an_animation_is_no_character(couple: Scene, body: Body, tmp_path: Path) -> None:

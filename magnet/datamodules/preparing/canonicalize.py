@@ -26,7 +26,7 @@ from magnet.motion.rotations import from_quat, quat_from_rotvec, to_quat
 from magnet.motion.runs import filled, true_runs
 from magnet.motion.scene import BODY_JOINTS, FPS, Scene, cat_agents
 
-CANONICALIZE_VERSION = 4
+CANONICALIZE_VERSION = 5
 """Raise it whenever the same recording would become other clips: prepared takes are then made anew."""
 FLOOR_PERCENTILE = 5.0
 """Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
