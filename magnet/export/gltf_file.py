@@ -50,9 +50,10 @@ class GltfFile:
         try:
             self.document, self.binary = _opened(data)
             self.nodes: list[dict[str, Any]] = self.document.get("nodes", [])
+            packed = set(self.document.get("extensionsRequired", [])) & set(PACKED)
         except (ValueError, struct.error, AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a whole {path.suffix.lower()} file ({error}): export it again") from error
-        if packed := set(self.document.get("extensionsRequired", [])) & set(PACKED):
+        if packed:
             raise ValueError(f"{path}: its motion is compressed ({min(packed)}): export it without compression")
 
     def numbers(self, index: int) -> Floats:
@@ -89,15 +90,20 @@ class GltfFile:
 
     def _linked(self, said: str, what: str) -> bytes:
         """What a URI stands for: bytes in itself, or a file in the folder of this one."""
-        head, comma, content = said.partition(",")
-        if comma and head.startswith("data:") and head.endswith(";base64"):
+        head, _, content = said.partition(",")
+        if head.startswith("data:"):
+            if not head.endswith(";base64"):
+                raise ValueError(f"its {what} in a URI ({said:.40}) that is not in base64: export it again")
             try:
                 return base64.b64decode(content, validate=True)
             except binascii.Error as error:
                 raise ValueError(str(error)) from error
         place = self.path.parent / unquote(said)
-        # What lies elsewhere would be put into files that are passed on.
-        if not place.resolve().is_relative_to(self.path.parent.resolve()) or not place.is_file():
+        try:  # what lies elsewhere would be put into files that are passed on
+            beside = place.resolve().is_relative_to(self.path.parent.resolve()) and place.is_file()
+        except (OSError, ValueError):  # no name that a file can have
+            beside = False
+        if not beside:
             raise ValueError(f"its {what} in another file ({said:.40}), which is not beside it: keep both together")
         return regular(place).read_bytes()
 

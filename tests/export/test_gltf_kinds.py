@@ -64,7 +64,9 @@ def test_a_text_with_its_numbers_beside_it_is_the_same_motion(
     assert off(got.scene, couple, body) < 1e-5 and "the body's own skeleton" in got.notes[0]
 
 
-@pytest.mark.parametrize("said", ["../secret.bin", "/etc/hostname", "gone.bin", "http://example.org/a.bin"])
+@pytest.mark.parametrize(
+    "said", ["../secret.bin", "/etc/hostname", "gone.bin", "http://example.org/a.bin", "a" * 5000, "a%00.bin"]
+)
 def test_what_does_not_lie_beside_a_text_is_not_read(said: str, couple: Scene, body: Body, tmp_path: Path) -> None:
     folder = tmp_path / "own"
     folder.mkdir()
@@ -74,7 +76,22 @@ def test_what_does_not_lie_beside_a_text_is_not_read(said: str, couple: Scene, b
         read(path)
 
 
-@pytest.mark.parametrize("text", ["{}", '{"asset": {"version": "1.0"}}', "{", '{"asset": 1}'])
+def test_numbers_in_a_uri_that_is_not_base64_are_one_short_line(couple: Scene, body: Body, tmp_path: Path) -> None:
+    path = as_text(save_glb(couple, tmp_path / "a.glb", body), lambda data: "data:application/x," + "a" * 5000)
+    with pytest.raises(ValueError, match=r"its numbers are in a URI \(data:.{35}\) that is not in base64"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        '{"asset": {"version": "1.0"}}',
+        "{",
+        '{"asset": 1}',
+        '{"asset": {"version": "2.0"}, "extensionsRequired": 5}',
+    ],
+)
 def test_a_text_that_is_no_gltf_is_one_line(text: str, tmp_path: Path) -> None:
     path = tmp_path / "a.gltf"
     path.write_text(text)
