@@ -85,7 +85,7 @@ def read(
     end: int | None = None,
     clip: str | None = None,
 ) -> Motion:
-    """Read a scene from our file, SMPL-X npz, BVH, GLB or FBX of any skeleton, or CSV; several are several people.
+    """Read our npz, SMPL-X npz, BVH, glTF, VRM or FBX of any skeleton, or CSV, as a scene; several are several people.
 
     Args:
         paths: the files, or lists of them.

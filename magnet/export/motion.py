@@ -58,12 +58,12 @@ class Motion(Scene):
         return Motion.of(on_floor(self.plain(), self._body()), self.model, self.notes)
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write the format of the path's suffix: .npz .bvh .glb .csv .html .mp4 .gif .webp .png.
+        """Write the format of the path's suffix: .npz .bvh .glb .vrma .csv .html .mp4 .gif .webp .png.
 
         Options are those of `magnet.export.formats.write`: fps, unit, smplx, style, title.
 
         Returns:
-            The path written; the first one if a format needs several files (one BVH per person).
+            The path written; the first one if a format needs several files (one BVH or VRM animation per person).
 
         Raises:
             ValueError: a suffix that nothing writes, no such option, or a scene that the format cannot hold.

@@ -118,7 +118,7 @@ def load_rigs(
     end: int | None = None,
     clip: str | None = None,
 ) -> Imported:
-    """Read BVH, GLB or FBX files, of one person or several: our own, or any skeleton with known joint names.
+    """Read BVH, glTF, VRM or FBX files, of one person or several: our own, or any skeleton with known joint names.
 
     A skeleton that is the body's own is restored exactly; any other is fitted: limbs to positions, all else to
     rotations relative to the file's rest pose, which may be a T or an A pose.
@@ -128,12 +128,12 @@ def load_rigs(
         trim: cut files of different lengths to the shortest.
         unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs, the same for all files
             if one suits them all.
-        up: `y`, `z`, `-y` ...; None: y of GLB and FBX, as their formats say, else found from where torsos point, and
+        up: `y`, `z`, `-y` ...; None: y of glTF and FBX, as their formats say, else found from where torsos point, and
             rest poses where somebody lies.
         joints: our joint's name to theirs, for names that no scheme knows.
         keep_floor: keep fitted people at the height they were recorded at.
         start, end: the frames of each file that are read, at its own rate, from 0 and without `end`; None: to the last.
-        clip: the animation of GLB files that is read, by its name; None: the first.
+        clip: the animation of glTF files that is read, by its name; None: the first.
 
     Raises:
         FileNotFoundError: there is no such file.
