@@ -168,7 +168,7 @@ def run_of(key: str, checkpoint: Path) -> dict[str, Any]:
 
 PLACE = r"(?:file:/|/(?=\S)|\\\\|\.\.[\\/]|~[\w.-]*/|[A-Za-z]:[\\/])"
 """How the name of a place on some machine begins."""
-INSIDE = rf"(?:(?<=[\"'\[({{<, =])|(?<=:)(?!//)){PLACE}[^\"',\])}}>;]*"
+INSIDE = rf"(?:(?<=[\"'`\[({{<, =;|])|(?<=:)(?!//)){PLACE}[^\"'`,\])}}>;|]*"
 """A place within a word, such as in a list or in brackets; of an address (https://) no part is one."""
 QUOTED = r"(?:\"[^\"]*\"|'[^']*'|\S)+"
 """A word of a text; what is quoted holds together."""

@@ -145,6 +145,7 @@ def test_a_released_folder_holds_no_folders_of_the_machine_that_trained(tuned: P
         ("of the lab (/home/anna/store), and '/home/anna b/x' by ben:/srv/y", "of the lab (store), and 'x' by ben:y"),
         ("file:///home/anna/store and (file:///home/anna/x)", "x)"),
         ("read file:///home/anna/store, (file:///home/anna/x)", "read store, (x)"),
+        ("of `/home/anna/store`, with a;/home/anna/b;/srv/c|/srv/d", "of `store`, with a;b;c|d"),
         ("../../anna/store", "store"),
         ("magnet fit --data.path '..\\anna\\store' --seed=../anna/x", "magnet fit --data.path store --seed=x"),
         ('magnet fit --notes "3 / 4 time, in /home/anna b/x"', "magnet fit --notes '3 / 4 time, in x'"),
