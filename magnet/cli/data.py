@@ -120,7 +120,7 @@ def add_work(one: argparse.ArgumentParser) -> None:
     add = one.add_argument
     add("--body", default="open", help="SMPL-X's or SMPL's file, npz or pkl (register at https://smpl-x.is.tue.mpg.de)")
     bodies = "folder or files of gendered bodies (SMPLX_FEMALE.npz ...) that the shape numbers belong to; people are "
-    add("--bodies", nargs="+", default=(), help=f"{bodies}expressed in the one --body")
+    add("--bodies", nargs="+", action="extend", default=[], help=f"{bodies}expressed in the one --body")
     add("--workers", type=int, default=min(8, os.cpu_count() or 1), help="processes (default: %(default)s)")
     add("--splits", default=None, help="lines NAME SPLIT or JSON, in place of the official splits")
     add("--limit", type=int, default=None, help="largest number of takes per split, to try things out")

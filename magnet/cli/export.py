@@ -62,7 +62,7 @@ def parser(out: bool = True) -> argparse.ArgumentParser:
     add("--clips", choices=("scene", "person"), default="scene", help=clips)
     own = options.add_argument_group("onto characters of your own, a file a person")
     rigs = "a character that is moved: .glb, .gltf, .vrm to .glb, .fbx to .fbx, .bvh to .bvh; one for all, or one each"
-    own.add_argument("--rig", nargs="+", default=[], metavar="FILE", help=rigs)
+    own.add_argument("--rig", nargs="+", action="extend", default=[], metavar="FILE", help=rigs)
     theirs = "left_hip=Thigh_L, where the character's names say nothing"
     own.add_argument("--rig_joint", action="append", default=[], metavar="OURS=THEIRS", help=theirs)
     pictures = options.add_argument_group("pictures, films and pages")
@@ -134,14 +134,14 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def out_before_rig(arguments: Sequence[str]) -> list[str]:
-    """The words, with OUT in front of --rig, which takes all words behind it, where the last of these is OUT.
+    """The words, with OUT as the last of them where it stands behind --rig, which takes all words behind it.
 
-    It is where one file alone is named elsewhere, or where those are all there and it is not.
+    The last of these is OUT where one file alone is named elsewhere, or where those are all there and it is not.
     """
     words = list(arguments)
     if "--rig" not in words:
         return words
-    at = words.index("--rig")
+    at = len(words) - 1 - words[::-1].index("--rig")
     end = next((n for n in range(at + 1, len(words)) if words[n].startswith("-")), len(words))
     before, rigs, behind = words[:at], words[at:end], words[end:]
     if len(rigs) < 3:
@@ -149,7 +149,7 @@ def out_before_rig(arguments: Sequence[str]) -> list[str]:
     files = parser(out=False).parse_intermixed_args([*before, *behind]).inputs
     if len(files) > 1 and (Path(rigs[-1]).exists() or not Path(files[-1]).exists()):
         return words
-    return [*before, rigs[-1], *rigs[:-1], *behind]
+    return [*before, *behind, *(f"--rig={rig}" for rig in rigs[1:-1]), rigs[-1]]
 
 
 def refuse_unused(options: argparse.Namespace, suffix: str) -> None:

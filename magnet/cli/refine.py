@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     add("--hands", choices=("keep", "hold"), default="keep", help=hands)
     add("--keep", **scene_files.PEOPLE, help="this person does not move; may be repeated")
     shapes = "people get the bodies of those in these files, or exchange theirs; steps stay, and hands that hold"
-    add("--shapes", nargs="+", metavar="FILE|exchange", help=shapes)
+    add("--shapes", nargs="+", action="extend", metavar="FILE|exchange", help=shapes)
     poses = "keep: people are moved over the ground as a whole, and nothing else is mended (default: %(default)s)"
     add("--poses", choices=("correct", "keep"), default="correct", help=poses)
     slides = "low toes slower than this, in m/s, shall stand still; 0: feet may slide (default: %(default)s)"
@@ -151,7 +151,8 @@ def shapes_of(options: argparse.Namespace, how: Reading, got: Read) -> Tensor:
     betas = other.betas[0, other.present[0]]
     people = scene.present.sum(dim=1)  # of each scene: free slots take none
     if len(betas) < int(people.max()):
-        raise CommandError(f"--shapes {named}: holds {len(betas)} people, expected {int(people.max())} or more")
+        holds = "1 person" if len(betas) == 1 else f"{len(betas)} people"
+        raise CommandError(f"--shapes {named}: holds {holds}, expected {int(people.max())} or more")
     return betas[(scene.present.cumsum(dim=1) - 1).clamp_min(0)]
 
 

@@ -44,11 +44,12 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--only",
         nargs="+",
-        default=[""],
+        action="extend",
         metavar="TEXT",
         help="run only cells whose name holds one of these, and what these need",
     )
-    add("--skip", nargs="+", default=[], metavar="TEXT", help="leave cells for later whose name holds one of these")
+    skip = "leave cells for later whose name holds one of these"
+    add("--skip", nargs="+", action="extend", default=[], metavar="TEXT", help=skip)
     add("--page_only", action="store_true", help="write the page from what is done")
     return options
 
@@ -80,7 +81,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         told(provenance()["git"]),
         own_data,
     )
-    wanted = [cell for cell in cells if held(cell.name, given.only) and not held(cell.name, given.skip)]
+    wanted = [cell for cell in cells if held(cell.name, given.only or [""]) and not held(cell.name, given.skip)]
     wanted = [cell for cell in cells if cell in wanted or cell in {each.needs for each in wanted}]
     todo = runner.missing(wanted)
     if given.dry_run:

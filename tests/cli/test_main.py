@@ -8,12 +8,15 @@ import re
 import signal
 import subprocess
 import sys
+from argparse import ArgumentParser
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
 from magnet import __version__, cli
+from magnet.cli import data, export, refine, report
 from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
@@ -58,6 +61,22 @@ def test_help_names_every_command() -> None:
 )
 def test_options_are_written_out(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     assert f"no option {words[-2]}" in complaint(capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("parser", "words"),
+    [
+        (export.parser, "in.npz out.glb --rig a b --rig c"),
+        (refine.parser, "in.npz out.npz --shapes a b --shapes c"),
+        (report.parser, "4 --only a b --only c"),
+        (report.parser, "4 --skip a b --skip c"),
+        (lambda: data.command_parser("prepare"), "--bodies a b --bodies c"),
+    ],
+)
+def test_options_of_several_values_may_be_repeated(parser: Callable[[], ArgumentParser], words: str) -> None:
+    """As those of one value; argparse would forget all but the last."""
+    given = parser().parse_intermixed_args(words.split())
+    assert getattr(given, words.rpartition(" --")[2].split()[0]) == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize(

@@ -232,7 +232,7 @@ def test_people_take_each_others_bodies_or_those_of_a_file(tmp_path: Path, capsy
     assert torch.equal(shaped.betas[shaped.present], betas[0])
     capsys.readouterr()
     for words, message in (
-        ([str(ours), "--shapes", str(one)], "holds 1 people, expected 2 or more"),
+        ([str(ours), "--shapes", str(one)], "holds 1 person, expected 2 or more"),
         ([str(one), "--shapes", "exchange"], "expected two people or more"),
         ([str(ours), "--shapes", "exchange", "--keep", "0"], "changes everybody's pose"),
         ([str(ours), "--shapes", str(tmp_path / "none.npz")], "no such file"),

@@ -14,6 +14,7 @@ from magnet.body.fit import floor_height
 from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.export import fbx, formats, save_bvh, save_glb
 from magnet.export.bones import BoneOptions
+from magnet.export.bvh_read import read_bvh
 from magnet.export.glb_read import read_glb
 from magnet.export.gltf_file import GltfFile
 from magnet.export.onto_rig import save_onto
@@ -201,6 +202,30 @@ def test_out_may_stand_behind_the_characters(
         assert f"{name}.bvh" in capsys.readouterr().out and Path(f"{name}.bvh").is_file()
     assert cli.main(["export", *["0.bvh", "1.bvh", "four.bvh", "--rig", "hero.bvh", "her.bvh"]]) == 2
     assert "--rig her.bvh: no such file" in capsys.readouterr().err
+
+
+def test_files_behind_the_characters_and_out_are_read_and_not_written_over(
+    salsa: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_bvh(someone(salsa), "hero.bvh", body)
+    save_bvh(salsa.slice(0, 8).permute_agents(torch.tensor([0])), "0.bvh", body)
+    recorded = Path("0.bvh").read_bytes()
+    for _ in range(2):  # and again, when OUT is there
+        assert cli.main(["export", *["--rig", "hero.bvh", "one.bvh", "--fps", "30", "0.bvh"]]) == 0
+        assert Path("0.bvh").read_bytes() == recorded and read("one.bvh").scene.frames == 8
+
+
+def test_rig_may_be_repeated(salsa: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    salsa.save("duet.npz")
+    rigs = [save_bvh(someone(salsa, shape), name, body)[0] for shape, name in (((), "a.bvh"), ((3.0,), "b.bvh"))]
+    for words in ("one.bvh --rig a.bvh --rig b.bvh", "--rig a.bvh --rig b.bvh one.bvh"):
+        assert cli.main(["export", "duet.npz", *words.split()]) == 0
+        for person, rig in enumerate(rigs):
+            assert np.allclose(read_bvh(f"one_person{person}.bvh").offsets[1:], read_bvh(rig).offsets[1:], atol=1e-4)
+        for path in tmp_path.glob("one*"):
+            path.unlink()
 
 
 def test_several_scenes_get_a_file_a_person_each(salsa: Scene, body: Body, tmp_path: Path) -> None:
