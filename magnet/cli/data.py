@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli import answers
-from magnet.cli.data_options import all_reader_options, job_of, reader_parser
+from magnet.cli.data_options import besides_reader_options, job_of, reader_parser
 from magnet.cli.data_shown import (
     add_list,
     file_bars,
@@ -25,6 +25,7 @@ from magnet.cli.data_shown import (
     why_untrained,
 )
 from magnet.cli.errors import CommandError, no_such
+from magnet.cli.flags import PlainParser
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -63,11 +64,13 @@ def main(arguments: Sequence[str]) -> int:
             no_such("command", f"data {command}", [f"data {name}" for name in COMMANDS], "magnet data --help")
         )
     # Intermixed, so that OUT may come after options: argparse would take it as left out once another came before them.
-    known, rest = command_parser(command).parse_known_intermixed_args(words)
-    if rest and not (command in ("prepare", "check") and all_reader_options(rest)):
+    options = command_parser(command)
+    known, rest = options.parse_known_intermixed_args(words)
+    if wrong := besides_reader_options(rest) if command in ("prepare", "check") else rest:
         folder = "; the folder that is read is --root FOLDER" if command == "prepare" else ""
-        wrong = f"no option {rest[0]}" if rest[0].startswith("-") else f"got {rest[0]}, expected an option{folder}"
-        raise ValueError(f"magnet data {command}: {wrong}; see magnet data {command} --help")
+        name = wrong[0].partition("=")[0]
+        no_option = f"no option {name}{options.closest(name)}"
+        options.error(no_option if name.startswith("-") else f"got {wrong[0]}, expected an option{folder}")
     known.reader_options = rest
     return show_help(known) if known.help else int(known.run(known))
 
@@ -83,10 +86,10 @@ def parser() -> argparse.ArgumentParser:
     return whole
 
 
-def command_parser(command: str) -> argparse.ArgumentParser:
+def command_parser(command: str) -> PlainParser:
     """A command's options."""
     add, run, what = COMMANDS[command]
-    one = argparse.ArgumentParser(f"magnet data {command}", description=what, add_help=False, allow_abbrev=False)
+    one = PlainParser(f"data {command}", what, add_help=False)
     one.add_argument("-h", "--help", action="store_true", help="show this")
     add(one)
     one.set_defaults(run=run, parser=one)

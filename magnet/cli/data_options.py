@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     from magnet.datamodules.reading.recording import Reader
 
 
-def all_reader_options(words: Sequence[str]) -> bool:
-    """Whether words are `--reader.OPTION VALUE` or `--reader.OPTION=VALUE` alone."""
-    expected = "flag"
+def besides_reader_options(words: Sequence[str]) -> list[str]:
+    """Words that belong to no `--reader.OPTION VALUE` or `--reader.OPTION=VALUE`."""
+    found, takes_values = [], False
     for word in words:
-        if word.startswith("--reader."):
-            expected = "value or flag" if "=" not in word else "flag"
-        elif expected == "flag":
-            return False
-    return True
+        if word.startswith("--"):
+            takes_values = word.startswith("--reader.") and "=" not in word
+        if not takes_values and not word.startswith("--reader."):
+            found.append(word)
+    return found
 
 
 def reader_parser(kind: type[Reader]) -> Any:

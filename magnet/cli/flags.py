@@ -94,12 +94,17 @@ class PlainParser(argparse.ArgumentParser):
         command: its name behind `magnet`.
         description: what it does, printed as it is written.
         epilog: examples, printed as they are written.
+        add_help: whether it has --help.
     """
 
-    def __init__(self, command: str, description: str | None, epilog: str | None = None) -> None:
-        how = argparse.RawDescriptionHelpFormatter
+    def __init__(self, command: str, description: str | None, epilog: str | None = None, add_help: bool = True) -> None:
         super().__init__(
-            f"magnet {command}", description=description, epilog=epilog, formatter_class=how, allow_abbrev=False
+            f"magnet {command}",
+            description=description,
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            add_help=add_help,
         )
         self.command = command
         self.elsewhere: dict[str, str] = {}  # options of other commands, and what is to be done instead
@@ -113,10 +118,14 @@ class PlainParser(argparse.ArgumentParser):
             self.given.append(word)
         return super().parse_known_intermixed_args(self.given, namespace)
 
+    def closest(self, name: str) -> str:
+        """A hint at which of its options may be meant."""
+        return closest(name, list(self._option_string_actions))
+
     def error(self, message: str) -> NoReturn:
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)
         name = unknown[1].partition("=")[0] if unknown else ""
-        hint = closest(name, list(self._option_string_actions)) if unknown else ""
+        hint = self.closest(name) if unknown else ""
         hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
         message = f"no option {name}" if unknown else plainly(message)  # as the commands with a Trainer say it
         said = self.given

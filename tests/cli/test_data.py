@@ -122,9 +122,11 @@ def test_a_check_of_a_store_refuses_options_that_would_change_nothing(made, caps
     assert f"has no use for {words[0]}; leave it out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("said", "up"), [(["--up", "z"], "+z"), (["--up=-z"], "-z"), ([], None)])
+@pytest.mark.parametrize(
+    ("said", "up"), [(["--up", "z"], "+z"), (["--up=-z"], "-z"), (["--up", "-z"], "-z"), ([], None)]
+)
 def test_an_up_axis_may_be_said_as_for_export(said, up):
-    given = data.command_parser("check").parse_args(["dl", *said])
+    given = data.command_parser("check").parse_intermixed_args(["dl", *said])
     given.reader_options = []
     assert data.job_of(given, "bvh", "dl").canonicalize.up == up
 
@@ -192,6 +194,11 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
         ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
+        ("prepare dd100 --root dl --out o --reader.people=actor --wrong 1", "no option --wrong"),
+        ("prepare dd100 --root dl --out o --reader.people actor --wrong=1", "no option --wrong."),
+        ("prepare dd100 --rooot dl --out o", "no option --rooot; did you mean --root?"),
+        ("prepare dd100 --root dl --out o --limit x", "--limit: got x, expected a whole number"),
+        ("fake dd100 new --takes", "--takes: expected one value behind it"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --reader.wrong 1", "no option --reader.wrong; there are"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --workers 0", "workers: got 0"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --up=up", "up: got 'up'"),
