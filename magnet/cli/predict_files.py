@@ -141,8 +141,6 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
-    from magnet.export.upright import WARNING
-    from magnet.generation.inputs import other_body
     from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
 
@@ -163,8 +161,7 @@ def main(arguments: Sequence[str]) -> int:
     files, lead = predict_written.in_front(files, scene)
     plan = plan_of_scene(model.denoiser, task.task, scene.agents, context, frames, sampler)
     unmade = ~plan.finished
-    if said := other_body(model.denoiser, recorded):
-        print(f"{WARNING}{said}")
+    scene_files.say_other_body(model.denoiser, recorded.body)
     for line in (
         *predict_written.said_of_invalid(scene, plan.known, lead),
         *predict_keys.said_of_keys(scene, plan.known, context // TOKEN_FRAMES),

@@ -13,6 +13,7 @@ from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser, help_topic
 
 if TYPE_CHECKING:
+    from magnet.denoiser.core import DenoiserCore
     from magnet.export.drawing import Size
     from magnet.export.reading import Read, Reading
     from magnet.motion.scene import Scene
@@ -302,6 +303,15 @@ def one_in_another(scene: Scene) -> list[str]:
         "given twice?"
         for one, other in pairs[:1]
     ]
+
+
+def say_other_body(model: DenoiserCore, body: str) -> None:
+    """Print a warning where people have another body, by its id, than those whom a model learned from."""
+    from magnet.export.upright import WARNING
+    from magnet.generation.inputs import other_body
+
+    if said := other_body(model, body):
+        print(f"{WARNING}{said}")
 
 
 def say_written(paths: Iterable[Path]) -> None:

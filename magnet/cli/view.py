@@ -233,6 +233,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
         raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
     found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
     model = DenoiserCore.load(found)
+    scene_files.say_other_body(model, scene.body)
     generator = torch.Generator().manual_seed(options.seed)
     sampler = sampler_options(options)
     recording = record(model, scene, task, options.context, options.frames, sampler, generator)
@@ -259,6 +260,7 @@ def _live(options: argparse.Namespace) -> Any:
 
     from magnet import checkpoints
     from magnet.body.base import load_body
+    from magnet.body.floor import open_body
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.cli.kept_checkpoints import told
     from magnet.denoiser.core import DenoiserCore
@@ -270,21 +272,24 @@ def _live(options: argparse.Namespace) -> Any:
 
     registry.get(options.task)
     folder = checkpoints.FOLDER / "duet" / "scenes"
-    examples = {path.stem: path for path in sorted(folder.glob("*.npz"))}
     body = load_body(options.body or "open")
     start, began = None, None
     if options.files:
         takes, body = _read(options)
         start = takes[0].scene
-    elif options.people is None:
+    own = body.id != open_body().id  # no example has it
+    examples = {} if own else {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    if start is None and options.people is None and examples:
         start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
     found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
     model = DenoiserCore.load(found)
+    scene_files.say_other_body(model, body.id)
     live = Live(
         model,
         2 if options.people is None else options.people,
         start,
         generator=torch.Generator().manual_seed(options.seed),
+        body=body.id,
     )
     live.settings.task, live.settings.sampler = options.task, sampler_options(options)
     live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance

@@ -8,6 +8,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from magnet.baselines.predictor import Generators, joints_of
@@ -30,6 +31,7 @@ from magnet.evaluation.scoring import (
     shared_world,
     slots_of,
 )
+from magnet.generation.inputs import other_body
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.metrics.interval import Unit
@@ -98,7 +100,7 @@ class Evaluator(L.LightningModule):
     # -- what the Trainer calls ----------------------------------------------------------------
 
     def setup(self, stage: str) -> None:
-        """Refuse what cannot be sampled.
+        """Refuse what cannot be sampled, and warn of people of another body than the model's.
 
         Raises:
             ValueError: data that say no context and horizon, or a precision that scenes do not survive.
@@ -112,6 +114,8 @@ class Evaluator(L.LightningModule):
             )
         self.denoiser.require_tokenizer()
         require_float32_scenes(self.trainer.precision)
+        if said := other_body(self.denoiser, data.body.id, data=True):
+            rank_zero_warn(said)
 
     def on_test_start(self) -> None:
         self.start(self.trainer.datamodule)  # type: ignore[attr-defined]

@@ -12,6 +12,7 @@ from magnet.body.base import MOST_SHAPE
 from magnet.body.floor import MOMENTS, lowest, off_floor, open_body
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
+from magnet.denoiser.token_core import TokenModelCore
 from magnet.export.misread import misread, steps_of
 from magnet.generation.conditioning import label
 from magnet.motion.required import require_rate
@@ -56,21 +57,28 @@ def check_request(
     require_rate(scene)
 
 
-def other_body(model: DenoiserCore, scene: Scene) -> str | None:
-    """Says that people have another body than those whom a model learned from; None: they have the same."""
+def other_body(model: TokenModelCore, body: str, data: bool = False) -> str | None:
+    """Says that people have another body than those whom a model learned from; None: they have the same.
+
+    Args:
+        model: which may not know its body, and then nothing is said.
+        body: the people's, its id.
+        data: they are of a data set, and not of files.
+    """
     trained = model.trained_body
-    if trained in (None, scene.body):
+    if trained in (None, body):
         return None
-    advice = "leave the body out" if trained == open_body().id else "give its file: body=FILE, or --body FILE"
+    file, none = ("--data.body_model FILE", "--data.body_model") if data else ("body=FILE, or --body FILE", "the body")
+    advice = f"leave {none} out" if trained == open_body().id else f"give its file: {file}"
     return (
-        f"the model was trained with body {trained!r}, but these people have {scene.body!r}, whose shape numbers mean "
+        f"the model was trained with body {trained!r}, but these people have {body!r}, whose shape numbers mean "
         f"something else; {advice}"
     )
 
 
 def warn_of_body(model: DenoiserCore, scene: Scene) -> None:
     """Warns whoever called a model's method where `other_body` says something."""
-    if (said := other_body(model, scene)) is not None:
+    if (said := other_body(model, scene.body)) is not None:
         warnings.warn(said, stacklevel=3)
 
 

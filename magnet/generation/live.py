@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from magnet.body.floor import open_body
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, require_soon, with_keyframes
@@ -88,6 +89,7 @@ class Live:
         start: a scene (B = 1) to go on from instead; whoever is present moves up to the first slots.
         partner: recorded motion (B = 1) of everybody, from which whoever is given is taken, in the same frames as the
             scene that grows; whoever is present moves up to the first slots, as in `start`.
+        body: the body of people from nothing, its id; None: that of `start`, or the open one.
         generator: source of all randomness.
 
     Attributes:
@@ -106,8 +108,10 @@ class Live:
         start: Scene | None = None,
         partner: Scene | None = None,
         generator: torch.Generator | None = None,
+        body: str | None = None,
     ) -> None:
         self.model = denoiser_of(model)
+        self.body = body or (open_body().id if start is None else start.body)
         self.generator = generator or torch.Generator(device=self.model.device).manual_seed(1)
         if partner is not None:
             require_rate(partner, "partner")
@@ -151,7 +155,8 @@ class Live:
         slots = self.model.layout.agents
         if not 1 <= people <= slots:
             raise ValueError(f"people: got {people}, expected 1 to {slots}, the slots that the model has")
-        empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=torch.ones(1, people, dtype=torch.bool))
+        there = torch.ones(1, people, dtype=torch.bool)
+        empty = empty_scene(1, 0, people, torch.zeros(1)).replace(present=there, body=self.body)
         made = self.sample(empty, Generation(), 0, FIRST)
         return made.replace(given=torch.zeros(1, FIRST, people, dtype=torch.bool))
 

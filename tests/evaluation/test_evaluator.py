@@ -1,5 +1,6 @@
 import json
 import math
+import warnings
 from dataclasses import replace
 from typing import ClassVar
 
@@ -300,6 +301,21 @@ def test_data_without_context_and_horizon_are_refused(what, named):
     got = r"\S+\.Foreign" if named else "no data module"
     with pytest.raises(ValueError, match=f"data: got {got}, expected a MotionDataModule, .* see docs/own.md"):
         getattr(trainer, what)(evaluation, **given)
+
+
+@pytest.mark.parametrize(
+    ("what", "trained"), [("test", "smplx-neutral"), ("predict", "smplx-neutral"), ("predict", "open-1")]
+)
+def test_data_of_another_body_than_the_models_are_warned_of(what, trained):
+    evaluation, trainer = prepared(baselines=False, samples=1)
+    evaluation.denoiser.trained_body = trained
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        getattr(trainer, what)(evaluation, datamodule=data())
+    said = [str(each.message) for each in caught if "trained with body" in str(each.message)]
+    assert len(said) == (trained != "open-1")
+    assert all("'smplx-neutral', but these people have 'open-1'" in each for each in said)
+    assert all(each.endswith("; give its file: --data.body_model FILE") for each in said)
 
 
 @pytest.mark.parametrize("name", ["samples", "baseline_stride"])

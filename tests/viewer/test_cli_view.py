@@ -8,14 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 
+from magnet import checkpoints
 from magnet.body import Body
 from magnet.cli import main, view
 from magnet.cli.view import arguments_of, sampler_options
+from magnet.datamodules.fakes.body import write_body
 from magnet.export import save_bvh
 from magnet.export.page.rig import VIEWS
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
+from magnet.testing import tiny_denoiser
+from magnet.training import origins
 from magnet.viewer import server
+from magnet.viewer.base import ViewerBase
 from tests.cases import some_slow
 
 
@@ -199,3 +204,40 @@ def test_live_takes_few_steps_unless_something_is_said() -> None:
     assert sampler_options(arguments_of(["--live", "--sampler", "paper"])) == SamplerOptions.preset("paper")
     assert sampler_options(arguments_of(["a.npz", "--record", "b.npz"])) == SamplerOptions(steps=10)
     assert arguments_of(["--live"]).people is None
+
+
+def trained_with(body: str, path: Path) -> Path:
+    """The checkpoint of a tiny denoiser that says with which body it was trained."""
+    model = tiny_denoiser()
+    checkpoint = {"state_dict": model.state_dict(), "hyper_parameters": dict(model.hparams)}
+    model.on_save_checkpoint(checkpoint)
+    checkpoints.save({**checkpoint, origins.KEY: {origins.STARTED: [], "data": [], "body": body}}, path)
+    return path
+
+
+@pytest.mark.parametrize("words", ["--live --people 2", "--live", "{scene} --record {out} --context 16 --frames 8"])
+def test_people_of_another_body_than_the_models_are_warned_of(
+    words: str, tmp_path: Path, duet: Scene, capsys, monkeypatch
+) -> None:
+    pytest.importorskip("viser")
+    monkeypatch.setattr(ViewerBase, "run", lambda _: None)
+    scene = duet.save(tmp_path / "a.npz")
+    for body in ("smplx-neutral", "open-1"):
+        path = trained_with(body, tmp_path / f"{body}.ckpt")
+        asked = words.format(scene=scene, out=tmp_path / f"{body}.npz").split()
+        how = ("--ckpt_path", str(path), "--steps", "2", "--port", "0", "--no_browser")
+        assert main(["view", *asked, *how]) == 0
+        said = "warning: the model was trained with body 'smplx-neutral', but these people have 'open-1', "
+        assert (said in capsys.readouterr().out) == (body == "smplx-neutral")
+
+
+@pytest.mark.parametrize("people", [(), ("--people", "2")])
+def test_people_from_nothing_have_the_body_that_is_given(people: tuple[str, ...], tmp_path: Path, monkeypatch) -> None:
+    """The example couple has the open one, so that with another one plays from nothing too."""
+    pytest.importorskip("viser")
+    shown = []
+    monkeypatch.setattr(ViewerBase, "run", lambda app: shown.append(app.live.scene.body))
+    how = ("--ckpt_path", str(trained_with("made-up-smplx", tmp_path / "a.ckpt")), "--steps", "2", "--port", "0")
+    body = str(write_body(tmp_path / "body.npz"))
+    assert main(["view", "--live", *people, "--body", body, "--no_browser", *how]) == 0
+    assert shown == ["made-up-smplx"]
