@@ -241,3 +241,13 @@ def test_people_from_nothing_have_the_body_that_is_given(people: tuple[str, ...]
     body = str(write_body(tmp_path / "body.npz"))
     assert main(["view", "--live", *people, "--body", body, "--no_browser", *how]) == 0
     assert shown == ["made-up-smplx"]
+
+
+@pytest.mark.parametrize("steps", [1, 31])
+def test_a_model_plays_live_in_as_few_or_many_steps_as_are_said(steps: int, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("viser")
+    played = []
+    monkeypatch.setattr(ViewerBase, "run", lambda app: played.append(app.live.settings.steps))
+    words = ["--live", "--ckpt_path", str(trained_with("open-1", tmp_path / "a.ckpt")), "--steps", str(steps)]
+    assert main(["view", *words, "--port", "0", "--no_browser"]) == 0
+    assert played == [steps]
