@@ -14,6 +14,8 @@ from typing import Any, NoReturn
 
 import yaml
 
+from magnet.cli.named_files import unquoted
+
 Options = dict[str, Any]
 NO_WORDS = {"true", "false", "yes", "no", "y", "n", "on", "off", "null", "none", "nan", "inf", "infinity"}
 """What YAML or Python may read as something else than a word."""
@@ -132,7 +134,7 @@ class PlainParser(argparse.ArgumentParser):
         several = [flag for each in self._actions if each.nargs == "+" for flag in each.option_strings if flag in said]
         if message.endswith("required: OUT") and several:
             hint = f"; files stand first, then options, for {several[0]} takes all words behind it"
-        print(refused(self.command, message + hint), file=sys.stderr)
+        print(refused(self.command, message + hint + unquoted(said)), file=sys.stderr)
         sys.exit(2)
 
 

@@ -13,6 +13,7 @@ from types import FrameType
 
 from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
+from magnet.cli.named_files import unquoted
 from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
 from magnet.errors import Stopped
 from magnet.version import __version__
@@ -106,7 +107,7 @@ def answered(arguments: Sequence[str] | None = None) -> int:
         message = explain(error)
         if debug or message is None:
             raise
-        return complain(message)
+        return complain(message + unquoted(arguments))
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
+from magnet.cli.named_files import unquoted
 from magnet.cli.nested import as_key, flat_key, in_files, no_class, place_of, with_place
 
 USAGE = (
@@ -164,7 +165,7 @@ class Parser(LightningArgumentParser):
         """Say what is wrong, and the closest thing that would be right."""
         told = self if self.command or Parser.root is None else Parser.root
         said = told.clearer(message)
-        print(refused(told.command, said), file=sys.stderr)
+        print(refused(told.command, said + unquoted(told.arguments)), file=sys.stderr)
         sys.exit(2)
 
     def clearer(self, message: str) -> str:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from magnet.cli import predict_keys, predict_written, scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import taken_out
+from magnet.cli.named_files import READ, require_there, require_whole
 from magnet.cli.predict_lengths import CONTEXT, FUTURE, lengths
 from magnet.sampling.presets import PRESETS
 
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from magnet.sampling.options import SamplerOptions
 
 HELP = "magnet predict --help files"
-READ = (".npz", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
-"""`magnet.export.reading.READ`, which would import torch."""
 
 EPILOG = """\
 IN is a .bvh, .glb, .gltf, .vrma or .fbx of any skeletons, a .csv of joint positions, an SMPL-X .npz or a scene of
@@ -133,6 +132,7 @@ def main(arguments: Sequence[str]) -> int:
     scene_files.require_files_to_cut(options.inputs, options.start, options.end)
     if not options.out:
         raise CommandError(f"say where to: --out FILE, whose suffix says what is written; see {HELP}")
+    require_whole(options.out)
     scene_files.require_not_there(options.inputs, options.out)
     require_counts(options)
     size, one = tuple(options.size), options.samples == 1
@@ -203,9 +203,8 @@ def require_files(paths: Sequence[str]) -> None:
     Raises:
         CommandError: names what is wrong.
     """
+    require_there(paths)
     for path in map(Path, paths):
-        if path.suffix.lower() in READ and not path.exists():
-            raise CommandError(f"{path}: no such file")
         if path.is_dir():
             raise CommandError(f"{path} is a folder: give its files, {files_of(path)}")
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError
-from magnet.cli.flags import PlainParser, help_topic
+from magnet.cli.flags import PlainParser, help_topic, valued
+from magnet.cli.named_files import READ, require_there
 
 if TYPE_CHECKING:
     from magnet.denoiser.core import DenoiserCore
@@ -51,8 +52,11 @@ def require_no_files_meant(arguments: Sequence[str]) -> None:
     """Refuse options of files where no file and no people are named, so that a data set is to be sampled.
 
     Raises:
-        CommandError: names the option, and the two ways to say what is meant.
+        CommandError: names the option, and the two ways to say what is meant; or a word in the place of a file.
     """
+    first, outs = next(iter(arguments), "-"), [value for name, value in valued(arguments) if name == "--out"]
+    if not first.startswith("-") and any(Path(out).suffix for out in outs):
+        raise CommandError(f"{first}: no such file; the name of a file to read ends in {', '.join(READ)}")
     names = () if help_topic(arguments) is not None else (argument.partition("=")[0] for argument in arguments)
     if name := next((name for name in names if name in OF_FILES), None):
         raise CommandError(
@@ -218,6 +222,7 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
     """
     from magnet.export.reading import read
 
+    require_there(options.inputs)
     require_each_once(options.inputs)
     got = read(options.inputs, options.body, reading)
     for note in [*got.notes, *one_in_another(got.scene)]:

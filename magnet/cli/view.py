@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
 from magnet.cli.flags import PlainParser
+from magnet.cli.named_files import require_there
 from magnet.sampling.presets import PRESETS, preset_name
 
 if TYPE_CHECKING:
@@ -164,6 +165,7 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     from magnet.body.base import load_body
     from magnet.viewer.takes import read_takes
 
+    require_there(options.files)
     body = load_body(options.body or "open")
     how, _ = _how_read(options)
     takes, body = read_takes(options.files, body, options.context, options.samples, how, print)
