@@ -130,14 +130,15 @@ def import_named(given: Arguments) -> None:
     """
     from magnet.datamodules.registry import import_local
 
-    named = [(f"--{key}", given.class_of(key)) for key in ("model", "data")]
-    for layer in given.layers:  # tasks have names of their own
-        classes = class_paths({key: part for key, part in layer.options.items() if key != "task"})
-        named += [(layer.path or "a file", path) for path in classes]
-    for where, path in named:
+    named = [(f"--{key}", given.class_of(key), key == "data") for key in ("model", "data")]
+    for layer in given.layers:
+        for key, part in layer.options.items():
+            classes = class_paths(part) if key != "task" else ()  # tasks have names of their own
+            named += [(layer.path or "a file", path, key == "data") for path in classes]
+    for where, path, data in named:
         if path and "." in path:
             try:
-                import_local(path)
+                import_local(path, data)
             except ValueError as error:
                 raise CommandError(f"{where} {error}") from error
 

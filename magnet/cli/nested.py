@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,24 +155,39 @@ def with_place(layers: Sequence[str], files: Sequence[str], flags: Sequence[str]
     return told.replace(f"--{field}", place[0], 1) if place else told
 
 
-def no_class(files: Sequence[str], flags: Sequence[str], key: str, name: str, known: Collection[str]) -> str:
+def no_class(
+    files: Sequence[str],
+    flags: Sequence[str],
+    key: str,
+    name: str,
+    known: Collection[str],
+    paths: Mapping[str, str] | None = None,
+) -> str:
     """Says that there is no such class, with its place where a file names it, and what may be meant.
 
     Args:
         files: the user's own, of YAML.
         flags: the command line, which beats them.
-        key: what the class is: model or data.
+        key: what the class is: model, data or callback.
         known: the short names that there are.
+        paths: by short name, of those that are known by a dotted path alone.
     """
     given = any(value.strip("'\"") == name for _, value in valued(flags))
     found = None if given else in_files(files, "class_path", name) or in_files(files, key, name)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}, or give a dotted path of your own"
+    written = {**(paths or {}), **{each: each for each in known}}
+    close = difflib.get_close_matches(name.rpartition(".")[2], written, n=1)
+    there = f"there are {', '.join(written.values())}, or give a dotted path of your own"
+    hint = f"did you mean {written[close[0]]}?" if close else there
     return f"{': '.join(found)}: no {key} {name}; {hint}" if found else f"no {key} {name}; {hint}"
 
 
 def of_task(files: Sequence[str], flags: Sequence[str], told: str) -> str:
-    """A sentence on an option of a task or its value, such as `no option --task.FIELD`, with its place in a file."""
+    """A sentence on a task, its option or a value, such as `no option --task.FIELD`, with its place in a file."""
+    if unknown := re.match(r"no task named (\w+)", told):
+        given = any(name in ("--task", "--task.class_path") for name, _ in valued(flags))
+        found = None if given else in_files(files, "task.class_path") or in_files(files, "task", unknown[1])
+        found = found or (None if given else in_files(files, "task.name", unknown[1]))
+        return f"{': '.join(found)}: {told}" if found else told
     match = re.match(r"no option --(task\.\w+)", told)
     if match is None:
         return with_place((), files, flags, told)

@@ -18,6 +18,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
+from magnet.cli.misnamed import no_such_class
 from magnet.cli.named_files import unquoted
 from magnet.cli.nested import as_key, flat_key, in_files, no_class, place_of, with_place
 
@@ -196,6 +197,8 @@ class Parser(LightningArgumentParser):
         path = re.search(r"(?:Expected a dot import path string|Unexpected import path format): (\S+)", message)
         if named and path and named[1] in self.classes:
             return no_class(self.files, self.arguments, named[1], path[1], self.classes[named[1]])
+        if told := no_such_class(message, self.files, self.arguments):
+            return told
         key = re.search(r'Parser key "([\w.]+)"', message)
         if key and (told := wrong_value(message, self._written(key[1], f"--{key[1]}"))):
             return with_place(self.layers, self.files, self.arguments, told)

@@ -115,7 +115,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         try:
             task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
         except CommandError as error:
-            raise CommandError(nested.of_task([each.path for each in given.layers], fields, str(error))) from error
+            said = [*fields, *given.of("task")]
+            raise CommandError(nested.of_task([each.path for each in given.layers], said, str(error))) from error
         task = replace(task, asked=bool(fields or given.of("task")))
     layers = [each.text() for each in settled.layers if each.options]
     asked = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)

@@ -219,8 +219,10 @@ def fit_command(data: str) -> str:
     return f"magnet fit --model Tokenizer --data {data}"
 
 
-def import_local(path: str) -> None:
+def import_local(path: str, data: bool = True) -> None:
     """Import the module of `module.Class`, also from the working directory if Python finds it nowhere else.
+
+    data: whether a data set is meant, and not a model or a callback.
 
     Raises:
         ValueError: there is no such module, or it cannot be imported, or has no such class; says what there is.
@@ -237,7 +239,11 @@ def import_local(path: str) -> None:
     if not hasattr(kind, name):
         has = [key for key, value in vars(kind).items() if _is_data(value) and value.__module__ == module]
         file = os.path.relpath(kind.__file__) if kind.__file__ else module
-        raise ValueError(f"{path}: {file} has no {name}; its data sets are {', '.join(has) or 'none'}")
+        close = [] if data else difflib.get_close_matches(name, vars(kind), n=1)
+        may_be = f"; did you mean {module}.{close[0]}?" if close else ""
+        raise ValueError(
+            f"{path}: {file} has no {name}" + (f"; its data sets are {', '.join(has) or 'none'}" if data else may_be)
+        )
 
 
 def _is_data(value: object) -> bool:
