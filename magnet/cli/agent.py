@@ -31,6 +31,7 @@ for example, in two terminals:
   magnet agent --name A --scene start.npz --listen tcp://127.0.0.1:5601 --connect B=tcp://127.0.0.1:5602
   magnet agent --name B --scene start.npz --listen tcp://127.0.0.1:5602 --connect A=tcp://127.0.0.1:5601
 """
+MOST_THREADS = 1024
 
 
 def parser() -> argparse.ArgumentParser:
@@ -85,8 +86,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     for name in ("patience", "meet"):
         if not 0 <= getattr(given, name) < float("inf"):
             raise CommandError(f"--{name} is {getattr(given, name):g}, expected seconds, 0 or more")
-    if given.threads < 1:
-        raise CommandError(f"--threads is {given.threads}, expected at least 1")
+    if not 1 <= given.threads <= MOST_THREADS:
+        raise CommandError(f"--threads is {given.threads}, expected 1 to {MOST_THREADS}")
     import torch
 
     from magnet.api import read

@@ -332,7 +332,7 @@ def run_prepare(given: argparse.Namespace) -> int:
 
 def run_fake(given: argparse.Namespace) -> int:
     from magnet.datamodules import registry
-    from magnet.datamodules.clip import at_least
+    from magnet.datamodules.clip import MOST, at_least, at_most
     from magnet.files import writing
 
     name, out = needed(given, "name", "out")
@@ -341,6 +341,7 @@ def run_fake(given: argparse.Namespace) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} is not empty; give a new folder")
     at_least(1, takes=given.takes, frames=given.frames)
+    at_most(MOST, takes=given.takes, frames=given.frames)
     with writing(folder, "choose another --out"):
         kind.write_fake(folder, given.takes, given.frames, given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]

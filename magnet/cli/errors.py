@@ -11,6 +11,8 @@ from collections.abc import Sequence
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LOST = r"(?i)gloo|nccl|connection (reset|closed|refused)|remote process"
 """What torch says where a process of a training no longer answers."""
+SHORT = r"(?i)not enough memory|out of memory|can't allocate memory|unable to allocate"
+"""What torch and NumPy say where memory does not suffice."""
 UNION = "Does not validate against any of the Union subtypes"
 """How jsonargparse begins to tell that a class refused its options."""
 
@@ -38,6 +40,11 @@ def explain(error: Exception) -> str | None:
         return (
             "another process of this training has ended, and so does this one; its own log says why. To go on from "
             "the last checkpoint, run the same command with --ckpt_path last (--debug shows where)"
+        )
+    if isinstance(error, MemoryError) or re.search(SHORT, text):
+        return (
+            "this takes more memory than there is: ask for less at a time, such as a smaller --data.batch_size or "
+            "model, fewer --samples, people or frames (--debug shows where)"
         )
     if isinstance(error, KeyError) and "Trying to restore optimizer state" in text:  # Lightning's
         return weights_alone()

@@ -15,6 +15,7 @@ from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
 from magnet.cli.named_files import unquoted
 from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
+from magnet.cli.run_numbers import too_large
 from magnet.errors import Stopped
 from magnet.version import __version__
 
@@ -104,7 +105,8 @@ def answered(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if isinstance(error, BrokenPipeError) and output_closed():
             return CLOSED
-        message = explain(error)
+        overflow = isinstance(error, OverflowError) or "verflow when unpacking" in str(error)
+        message = (too_large(arguments) if overflow else None) or explain(error)
         if debug or message is None:
             raise
         return complain(message + unquoted(arguments))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +132,11 @@ def _within(node: yaml.Node | None, place: str) -> Iterator[tuple[str, int, yaml
 def _texts(value: yaml.Node) -> tuple[str, ...]:
     """How the parser may write a value."""
     read = str(yaml.safe_load(yaml.serialize(value, Dumper=yaml.SafeDumper)))
-    return (read, value.value) if isinstance(value, yaml.ScalarNode) else (read,)
+    if not isinstance(value, yaml.ScalarNode):
+        return (read,)
+    with suppress(ValueError):  # `1e9` is a word to YAML and a number to the parser
+        return (read, value.value, str(float(value.value)))
+    return (read, value.value)
 
 
 def with_place(layers: Sequence[str], files: Sequence[str], flags: Sequence[str], told: str) -> str:

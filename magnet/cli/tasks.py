@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jsonargparse import ArgumentError, ArgumentParser
 
+from magnet.checks import require_whole
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.cli.flags import taken_out
@@ -205,6 +206,9 @@ def as_flag(value: Any) -> str:
 
 # -- magnet tasks show -------------------------------------------------------------------------
 
+MOST_TOKENS, MOST_PEOPLE = 10_000, 200
+"""That a picture is drawn of."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
@@ -259,6 +263,8 @@ def show_task(arguments: list[str]) -> int:
     kind = task_class(name)
     fields = read_fields(show_parser(kind), rest, (), f"magnet tasks show {name} --help")
     task, shown = kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
+    require_whole("tokens", shown.tokens, most=MOST_TOKENS)
+    require_whole("people", shown.people, most=MOST_PEOPLE)
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)
     grid = Grid(*sizes, noise_sampling=shown.noise_sampling, turn=shown.turn, opening=shown.opening)
     schedule = schedule_of(task, grid)

@@ -26,6 +26,7 @@ from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
+from magnet.cli.run_numbers import require_numbers
 from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
 from magnet.datamodules.base import MotionDataModule
@@ -249,6 +250,7 @@ class MagnetCLI(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         self.config = parser.parse_args(args)
+        require_numbers(self.config[self.command])
 
     def _parse_ckpt_path(self) -> None:
         """Do nothing: Lightning's would let the checkpoint beat the user. See magnet.cli.checkpoint_config."""

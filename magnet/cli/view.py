@@ -22,6 +22,8 @@ ONLY_LIVE, ONLY_RECORD, NOT_LIVE = ("people",), ("frames",), ("html", "truth", "
 """Options of a model that generates, of both ways to let it, of either, and those of files that are only shown."""
 STEPS = 10
 """Denoising steps where nothing is said: quick enough to watch."""
+MOST_FRAMES = 1_000_000
+"""That --record adds."""
 EXAMPLE = "duet"
 """Scene that a live model goes on from where nothing is said: its couple stays together (docs/viewer.md)."""
 
@@ -147,6 +149,8 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError("--record continues one FILE, and is not --live")
     if options.record is not None and options.html is not None:
         raise ValueError("--html writes what FILE holds, --record continues it: record first, then --html its OUT.npz")
+    if options.frames > MOST_FRAMES:
+        raise ValueError(f"--frames {options.frames}: expected 1 to {MOST_FRAMES:,}")
     if options.context < 0 or options.samples < 1:
         raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
 

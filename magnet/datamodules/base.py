@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from magnet.body import Body, load_body
-from magnet.datamodules.clip import RESHAPED, Clip, Split, at_least
+from magnet.datamodules.clip import MOST, RESHAPED, Clip, Split, at_least, at_most
 from magnet.datamodules.doubted import doubt_of
 from magnet.datamodules.options import AUGMENTATION, HELD_OUT, Augmentation, HeldOutScenes
 from magnet.datamodules.store.loaders import FixedLoader, TrainLoader
@@ -23,6 +23,7 @@ from magnet.datamodules.store.windows import RandomWindows, composed_windows, fi
 from magnet.errors import DataError
 from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene
+from magnet.motion.tokens import MOST_SLOTS
 from magnet.plugins import attempted, told
 from magnet.seeding import derive
 
@@ -118,6 +119,8 @@ class MotionDataModule(LightningDataModule):
         super().__init__()
         at_least(1, window_frames=window_frames, batch_size=batch_size, max_agents=max_agents, epoch_size=epoch_size)
         at_least(1, val_batch_size=val_batch_size)
+        at_most(MOST, window_frames=window_frames, batch_size=batch_size, val_batch_size=val_batch_size)
+        at_most(MOST_SLOTS, max_agents=max_agents)
         at_least(0, read_ahead=read_ahead)
         self.window_frames = window_frames
         self.batch_size = batch_size

@@ -13,6 +13,8 @@ from magnet.motion.scene import Scene, require_rotations
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 Ints = NDArray[np.int64]
+MOST = 1_000_000
+"""Frames of a window or windows of a batch, at most: more is a slip."""
 RESHAPED = "-reshaped"
 """What stands behind the source of clips whose people have been given other bodies."""
 
@@ -63,6 +65,17 @@ class Clip:
         if self.scene.valid is None:
             return np.ones(self.frames, dtype=bool)
         return self.scene.valid[0].cpu().numpy()
+
+
+def at_most(most: int, **numbers: int) -> None:
+    """No number is larger.
+
+    Raises:
+        ValueError: names the one that is.
+    """
+    for name, number in numbers.items():
+        if number > most:
+            raise ValueError(f"{name}: got {number}, expected at most {most:,}")
 
 
 def at_least(least: int, **numbers: int | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from magnet.checks import require_number, require_whole
-from magnet.datamodules.clip import at_least
+from magnet.datamodules.clip import MOST, at_least, at_most
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,8 @@ class HeldOutScenes:
         at_least(1, horizon_frames=self.horizon_frames, stride=self.stride, limit=self.limit)
         at_least(1, batch_size=self.batch_size)
         at_least(0, context_frames=self.context_frames, composed=self.composed)
+        at_most(MOST, context_frames=self.context_frames, horizon_frames=self.horizon_frames)
+        at_most(MOST, composed=self.composed, batch_size=self.batch_size)
 
     @property
     def frames(self) -> int:

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from magnet.checks import require_whole
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.clip import SPLITS
 from magnet.datamodules.options import Augmentation
@@ -17,6 +18,8 @@ from magnet.synthesis import COUPLINGS, CoupledScene, synthesize
 NOT_COMPOSED = Augmentation(compose=0.0)
 SEEDS = 1_000_000
 """Seeds a split owns: clips of different splits never share one."""
+MOST_SEED = 10**12
+"""Of scenes: the seeds of their clips then are numbers that torch takes."""
 
 
 @register_data()
@@ -67,6 +70,7 @@ class Synthetic(MotionDataModule):
         ]
         if not self.kinds:
             raise ValueError(f"people: no group of {list(people)} fits {', '.join(names)}")
+        require_whole("scene_seed", scene_seed, -MOST_SEED, MOST_SEED)
         self.counts: dict[str, int] = {"train": train_clips, "val": val_clips, "test": test_clips}
         self.clip_frames = clip_frames
         self.scene_seed = scene_seed

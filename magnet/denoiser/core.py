@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from magnet import checkpoints
-from magnet.checks import require_choice
+from magnet.checks import require_choice, require_whole
 from magnet.denoiser import starting
 from magnet.denoiser.options import DenoiserLoss, NoiseOptions, Sampling, SelfForcing, TransformerOptions
 from magnet.denoiser.pairwise_posterior import PairwisePosterior
 from magnet.denoiser.token_core import TokenModelCore
 from magnet.denoiser.transformer import Transformer, skipped
 from magnet.motion.scene import Scene
-from magnet.motion.tokens import TokenLayout
+from magnet.motion.tokens import MOST_SLOTS, TokenLayout
 from magnet.precision import dtype_of
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.options import OptimizerOptions, group_of, plain
@@ -71,6 +71,7 @@ class DenoiserCore(TokenModelCore):
     ) -> None:
         super().__init__()
         require_choice("target", target, Target)
+        require_whole("max_agents", max_agents, most=MOST_SLOTS)
         self.network, self.noise = group_of(TransformerOptions, network), group_of(NoiseOptions, noise)
         self.loss, self.self_forcing = group_of(DenoiserLoss, loss), group_of(SelfForcing, self_forcing)
         self.optimizer, self.sampling = group_of(OptimizerOptions, optimizer), group_of(Sampling, sampling)

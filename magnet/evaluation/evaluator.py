@@ -47,6 +47,7 @@ __all__ = ["MODEL", "TRAINING", "TRUTH", "UNALIGNED", "Evaluator", "aligned", "s
 
 MODEL = "magnet"
 """The row of the model."""
+MOST_SAMPLES = 10_000
 
 
 class Evaluator(L.LightningModule):
@@ -87,6 +88,7 @@ class Evaluator(L.LightningModule):
     ) -> None:
         super().__init__()
         require_whole("samples", samples, 1)
+        require_whole("samples", samples, most=MOST_SAMPLES)
         require_whole("baseline_stride", baseline_stride, 1)
         self.denoiser, self.task, self.sampler = denoiser, task or JointFuture(), SamplerOptions.of(sampler or {})
         self.samples, self.baselines, self.seed = samples, baselines, seed

@@ -14,6 +14,8 @@ from magnet.motion.scene import Scene
 
 TOKEN_FRAMES = 4
 """Frames in a token: the temporal stride omega of the paper."""
+MOST_SLOTS = 1000
+"""People in a scene, at most: each token of each of them tells of all the others."""
 
 
 @dataclass(frozen=True)

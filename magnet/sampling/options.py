@@ -34,6 +34,8 @@ def require_spacing(spacing: str, shift: float) -> None:
 
 MOST_WEIGHT, MOST_BLEND = 1e6, 1_000_000
 """Of a pairwise transform and frames of a blend: beyond, numbers overflow."""
+MOST_SPACING = 1000.0
+"""Metres between the couples of a crowd: much farther from the middle float32 moves people in steps of millimetres."""
 
 
 @dataclass(frozen=True)
@@ -155,12 +157,12 @@ class SamplerOptions:
                 require_whole(name, getattr(self, name), 1)
         for name in ("pyramid_offset", "opening"):
             if getattr(self, name) is not None:
-                require_whole(name, getattr(self, name), 0)
+                require_whole(name, getattr(self, name), 0, LEVELS)
         require_number("pairwise_weight", self.pairwise_weight, 0, MOST_WEIGHT)
         require_whole("blend", self.blend, 0, MOST_BLEND)
         require_number("crowd_enter", self.crowd_enter, over=0)
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
-        require_number("crowd_spacing", self.crowd_spacing, over=0)
+        require_number("crowd_spacing", self.crowd_spacing, over=0, most=MOST_SPACING)
         require_number("eta", self.eta, 0, 1)
         if self.together is not None:
             require_number("together", self.together, least=0)
