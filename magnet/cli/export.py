@@ -181,9 +181,7 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
         ("size", FILM, PICTURES),
         ("title", None, shown),
     ):
-        said = getattr(options, flag)
-        if (tuple(said) if flag == "size" else said) != plain and suffix not in takes:
-            raise CommandError(f"--{flag}: is for {', '.join(takes)}, and does nothing in {suffix}")
+        scene_files.refuse_unused(options, flag, plain, takes, [suffix])
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:

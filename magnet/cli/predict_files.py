@@ -137,6 +137,7 @@ def main(arguments: Sequence[str]) -> int:
     require_counts(options)
     size, one = tuple(options.size), options.samples == 1
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
+    refuse_unused(options, [out.suffix.lower() for out in outs])
     from magnet.api import Model, Motion
     from magnet.cli.checkpoint_config import find_checkpoint
     from magnet.cli.kept_checkpoints import told
@@ -183,6 +184,18 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
+
+
+def refuse_unused(options: argparse.Namespace, suffixes: Sequence[str]) -> None:
+    """Refuse a look where no film, picture or page is written.
+
+    Raises:
+        CommandError: names the option and what it is for.
+    """
+    from magnet.export.formats import FILM, PICTURES
+
+    scene_files.refuse_unused(options, "style", "body", (".html", ".png", *PICTURES), suffixes)
+    scene_files.refuse_unused(options, "size", FILM, PICTURES, suffixes)
 
 
 def require_counts(options: argparse.Namespace) -> None:

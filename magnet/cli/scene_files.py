@@ -310,6 +310,29 @@ def one_in_another(scene: Scene) -> list[str]:
     ]
 
 
+def refuse_unused(
+    options: argparse.Namespace, flag: str, plain: object, takes: Sequence[str], suffixes: Sequence[str]
+) -> None:
+    """Refuse an option that no file to write has a use for.
+
+    Args:
+        options: the command line.
+        flag: the option's name.
+        plain: its default, which nobody has to have said.
+        takes: suffixes of files that it changes.
+        suffixes: of the files to write.
+
+    Raises:
+        CommandError: names the option and what it is for.
+    """
+    said = getattr(options, flag)
+    if (tuple(said) if isinstance(said, list) and isinstance(plain, tuple) else said) == plain:
+        return
+    if not set(takes) & set(suffixes):
+        named = " or ".join(dict.fromkeys(suffixes))
+        raise CommandError(f"--{flag}: is for {', '.join(takes)}, and does nothing in {named}")
+
+
 def say_other_body(model: DenoiserCore, body: str) -> None:
     """Print a warning where people have another body, by its id, than those whom a model learned from."""
     from magnet.export.upright import WARNING

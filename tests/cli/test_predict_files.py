@@ -334,6 +334,8 @@ def test_files_may_stand_behind_options() -> None:
         (["OURS", "--people", "1"], "--people 1: expected at least 2"),
         (["motion.usdz"], "cannot read motion.usdz: expected .npz or .csv files alone, or files of skeletons"),
         (["OURS", "--task", "joint_futur"], "did you mean joint_future?"),
+        (["OURS", "--style", "light"], "--style: is for .html, .png, .mp4, .gif, .webp, and does nothing in .npz"),
+        (["OURS", "--size", "64", "48"], "--size: is for .mp4, .gif, .webp, and does nothing in .npz"),
         (["OURS", "--task", "inbetweening", "--task.evry", "3"], "did you mean --task.every?"),
     ],
 )
