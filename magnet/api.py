@@ -116,7 +116,7 @@ def read(
 
 @dataclass(frozen=True, repr=False)
 class Model:
-    """A trained model with its sampler, for which a mapping of its options will do.
+    """A trained model with its sampler, for which a preset's name or a mapping of its options will do.
 
     What samples whole scenes takes `seed` (None: another result each time) and `samples`: sample s of scene b is scene
     b * samples + s of the result, which includes the given frames. `cond` is the condition of each scene, for models
@@ -127,7 +127,7 @@ class Model:
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __post_init__(self) -> None:
-        if isinstance(self.sampler, Mapping):
+        if isinstance(self.sampler, Mapping | str):
             object.__setattr__(self, "sampler", SamplerOptions.of(self.sampler))
         for name, kind in (("denoiser", DenoiserCore), ("sampler", SamplerOptions)):
             if not isinstance(getattr(self, name), kind):

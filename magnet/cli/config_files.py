@@ -28,7 +28,10 @@ class Layer:
 
     def text(self) -> str:
         """The file's path, or its options as YAML where they are not what the file says."""
-        expanded = with_presets(self.options)
+        try:
+            expanded = with_presets(self.options)
+        except CommandError as error:
+            raise CommandError(f"{self.path}: {error}" if self.path else str(error)) from error
         if Path(self.path).is_file() and read_yaml(self.path) == expanded:
             return self.path
         return yaml.safe_dump(expanded)

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import yaml
 
 from magnet.cli.named_files import unquoted
+from magnet.sampling.presets import PRESETS
 
 Options = dict[str, Any]
 NO_WORDS = {"true", "false", "yes", "no", "y", "n", "on", "off", "null", "none", "nan", "inf", "infinity"}
@@ -86,7 +87,7 @@ def plainly(message: str) -> str:
     if count := re.fullmatch(r"expected (one|at least one|\d+) arguments?", said):
         what = "one value" if count[1] == "one" else f"{count[1]} value{'s' * (count[1].isdigit())}"
         return f"{flag}: expected {what} behind it"
-    return message
+    return f"{flag}: {said}"
 
 
 class PlainParser(argparse.ArgumentParser):
@@ -140,6 +141,8 @@ class PlainParser(argparse.ArgumentParser):
 
 def closest(name: str, known: Sequence[str]) -> str:
     """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
+    if (told := of_preset(name, known)) is not None:
+        return told
     group, _, leaf = name.rpartition(".")
     flags = [flag for flag in known if not flag.endswith((".help", "+")) and flag != name]
     fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
@@ -152,6 +155,19 @@ def closest(name: str, known: Sequence[str]) -> str:
     if near:
         return f"; did you mean {' or '.join(near)}?"
     return f"; there are {', '.join(dict.fromkeys(fields))}" if group and fields else ""
+
+
+def of_preset(name: str, known: Sequence[str]) -> str | None:
+    """A hint where an option is meant that says how to sample: a preset is named by `--sampler` itself, and where that
+    takes nothing else, it has no fields; else None."""
+    if "--sampler" not in known:
+        return None
+    if name in ("--sampler.preset", "--sampler.name", "--preset"):
+        return f"; a preset is named by --sampler PRESET: {' or '.join(PRESETS)}"
+    if name.startswith("--sampler.") and not any(flag.startswith("--sampler.") for flag in known):
+        own = f"--{name.rpartition('.')[2]}"
+        return f"; --sampler takes a preset's name here{f', and there is {own}' if own in known else ''}"
+    return None
 
 
 def words(name: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 from magnet.checks import require_whole
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
-from magnet.cli.flags import taken_out
+from magnet.cli.flags import of_preset, taken_out
 from magnet.plugins import Registered, told
 from magnet.tasks import Task, registry
 from magnet.tasks.base import fault_of, schedule_of
@@ -145,6 +145,8 @@ def read_fields(
 def unknown_option(parser: ArgumentParser, flag: str, more: str) -> str:
     """The message for an option that does not exist."""
     flags = [each for action in parser._actions for each in action.option_strings if each.startswith("--")]
+    if (hint := of_preset(flag, flags)) is not None:
+        return f"no option {flag}{hint}"
     known = [
         each
         for each in flags

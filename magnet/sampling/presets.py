@@ -68,8 +68,8 @@ def preset_fields(name: str) -> dict[str, Any]:
         ValueError: no such preset; suggests the closest.
     """
     if name not in PRESETS:
-        close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(PRESETS)}"
+        close, there = difflib.get_close_matches(name.lower(), PRESETS, n=1), ", ".join(PRESETS)
+        hint = f"did you mean {close[0]}? There are {there}" if close else f"there are {there}"
         raise ValueError(f"no sampler preset {name}; {hint}")
     return PRESETS[name]
 

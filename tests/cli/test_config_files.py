@@ -89,9 +89,28 @@ def test_a_wrong_preset_suggests_the_closest(toy: Path, capsys: pytest.CaptureFi
     assert "no sampler preset papr; did you mean paper?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["test", "predict", "predict a.bvh", "view --live", "score"])
+@pytest.mark.parametrize("flag", ["--sampler.preset", "--sampler.name", "--preset"])
+def test_a_preset_in_another_place_is_told_its_own(
+    toy: Path, capsys: pytest.CaptureFixture[str], command: str, flag: str
+) -> None:
+    (toy / "a.bvh").touch()
+    out = ("--out", "o.npz") if command == "predict a.bvh" else ()
+    assert cli.main([*command.split(), flag, "paper", *out]) == 2
+    said = f"no option {flag}; a preset is named by --sampler PRESET: default or steady or plain or "
+    assert said in capsys.readouterr().err
+
+
+def test_where_only_a_preset_is_taken_its_fields_lead_there(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["view", "--live", "--sampler.steps", "3"]) == 2
+    said = capsys.readouterr().err
+    assert "no option --sampler.steps; --sampler takes a preset's name here, and there is --steps." in said
+
+
 def test_a_wrong_preset_in_a_file_suggests_the_closest(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (toy / "word.yaml").write_text("sampler: papers\n")
-    assert "did you mean paper?" in complaint(capsys, "test", "--config", "word.yaml")
+    said = "word.yaml: no sampler preset papers; did you mean paper? There are default, steady, "
+    assert said in complaint(capsys, "test", "--config", "word.yaml")
 
 
 def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,7 +78,13 @@ def test_fields_replace_those_of_a_preset():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "hint"), [("papr", "did you mean paper?"), ("xyz", "there are default, steady, plain, strides, paper")]
+    ("wrong", "hint"),
+    [
+        ("papr", "did you mean paper? There are default, steady"),
+        ("Paper", "did you mean paper?"),
+        ("xyz", "there are default, steady, plain, strides, paper"),
+        ("fast", "there are default, steady, plain, strides, paper"),
+    ],
 )
 def test_a_wrong_name_suggests_the_closest(wrong: str, hint: str):
     import argparse
@@ -94,6 +100,9 @@ def test_the_python_interface_takes_a_preset_by_name():
 
     assert magnet.load("duet", sampler="paper", steps=7).sampler == SamplerOptions.preset("paper", steps=7)
     assert magnet.load("duet").sampler == SamplerOptions()
+    assert magnet.Model(magnet.load("duet").denoiser, "paper").sampler == SamplerOptions.preset("paper")
+    with pytest.raises(ValueError, match=r"steps: got 'paper', a preset: SamplerOptions.preset\('paper'\)"):
+        SamplerOptions("paper")
     with pytest.raises(ValueError, match="did you mean paper"):
         magnet.load("duet", sampler="paperr")
 
