@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.body import Body
+from magnet.body import Body, load_body
 from magnet.body.floor import open_body
-from magnet.checks import require_whole, require_wholes
+from magnet.checks import require_whole, slots_of
 from magnet.denoiser.core import DenoiserCore
 from magnet.export import reading
 from magnet.export.motion import Motion, NotebookView
@@ -146,11 +145,15 @@ class Model:
         people: int = 2,
         frames: int = 300,
         *,
+        body: str | Path | Body | None = None,
         seed: int | None = None,
         samples: int = 1,
         cond: Tensor | None = None,
     ) -> Motion:
         """Generate a scene of people of average shape, or a crowd of more than `most_people`, who differ.
+
+        Args:
+            body: their body model, or its file, as of the people the model was trained on; None: the open one.
 
         Raises:
             ValueError: more than 200 people.
@@ -160,6 +163,9 @@ class Model:
         scene = crowd_from_nothing(people, torch.Generator().manual_seed(self._generator(seed).initial_seed()))
         if people <= self.most_people:
             scene = scene.replace(betas=torch.zeros_like(scene.betas))
+        if body is not None:
+            given = body if isinstance(body, Body) else load_body(body)
+            scene = Motion.of(scene.replace(body=given.id), given)
         return self.predict(scene, "generation", context=0, frames=frames, **said)
 
     def start_crowd(
@@ -219,7 +225,7 @@ class Model:
             ValueError: no such agent, nobody else in the scene, or a shape of the wrong size.
         """
         require_rate(scene)
-        targets = _slots("agent", agent, self.most_people, "the model takes agents")
+        targets = slots_of("agent", agent, self.most_people, "the model takes agents")
         if not targets:
             raise ValueError("agent: got none; name who is to be filled in")
         scene = scene.pad_agents(max(*targets, scene.agents - 1) + 1)
@@ -250,7 +256,7 @@ class Model:
             block: token steps (of 4 frames) that are generated at a time; the others are seen up to their end.
         """
         require_rate(scene)
-        fields: dict[str, Any] = {"target": _slots("agent", agent, scene.agents), "block": block}
+        fields: dict[str, Any] = {"target": slots_of("agent", agent, scene.agents), "block": block}
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, **fields)
 
     def partner(
@@ -270,7 +276,7 @@ class Model:
         """
         plain, body = _with_its_body(past, "past")
         warn_of_body(self.denoiser, plain)
-        how = (_slots("agents", agents, plain.agents, "past has people"), self.sampler, self._generator(seed), block)
+        how = (slots_of("agents", agents, plain.agents, "past has people"), self.sampler, self._generator(seed), block)
         partner = LivePartner(self.denoiser, plain, *how)
         partner.model = body
         return partner
@@ -385,16 +391,3 @@ def _with_its_body(scene: Scene, label: str = "the scene") -> tuple[Scene, Body 
             "magnet.read(..., body=FILE) or Motion.of(scene, magnet.load_body(FILE))"
         )
     return plain, body
-
-
-def _slots(name: str, agents: int | Sequence[int], count: int, has: str = "the scene has people") -> tuple[int, ...]:
-    """One slot or several of so many, as a task takes them.
-
-    Raises:
-        ValueError: no whole numbers, or no such slot.
-    """
-    several = (agents,) if isinstance(agents, int | np.integer) else agents
-    require_wholes(name, several)
-    if strange := [agent for agent in several if not 0 <= agent < count]:
-        raise ValueError(f"{name} {strange[0]}: {f'{has} 0 to {count - 1}' if count else 'nobody is in the scene'}")
-    return tuple(int(agent) for agent in several)

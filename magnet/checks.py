@@ -94,3 +94,16 @@ def _fits(value: object, whole: bool) -> bool:
     if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
         return False
     return math.isfinite(value)
+
+
+def slots_of(name: str, agents: int | Sequence[int], count: int, has: str = "the scene has people") -> tuple[int, ...]:
+    """One slot or several of so many, as a task takes them.
+
+    Raises:
+        ValueError: no whole numbers, or no such slot.
+    """
+    several = agents if isinstance(agents, Sequence) else (agents,)
+    require_wholes(name, several)
+    if strange := [agent for agent in several if not 0 <= agent < count]:
+        raise ValueError(f"{name} {strange[0]}: {f'{has} 0 to {count - 1}' if count else 'nobody is in the scene'}")
+    return tuple(int(agent) for agent in several)

@@ -240,8 +240,7 @@ def test_a_notebook_plays_a_page_or_a_film(model: Model, tmp_path: Path):
 
 
 def test_files_of_any_kind_are_read_at_the_models_rate(model: Model, duet: Scene, tmp_path: Path):
-    paths = save_bvh(duet.replace(fps=60.0), tmp_path / "a.bvh", load_body())
-    motion = magnet.read(*paths)
+    motion = magnet.read(*save_bvh(duet.replace(fps=60.0), tmp_path / "a.bvh", load_body()))
     assert (motion.fps, motion.frames, motion.agents) == (30.0, 25, 2)
     assert any("own skeleton" in note for note in motion.notes)
     assert model.continue_(motion, frames=8, seed=1).frames == 32
@@ -267,11 +266,12 @@ def test_a_live_partners_answer_and_each_person_are_motions_with_the_body_of_the
     assert type(duet.people()) is Scene
 
 
-def test_a_scene_with_its_own_body_is_continued_and_keeps_it(model: Model, duet: Scene):
+def test_people_of_a_body_of_their_own_are_continued_or_made_from_nothing(model: Model, duet: Scene):
     body = copy.deepcopy(load_body())
     body.id = "mine"
-    motion = model.continue_(Motion.of(duet.replace(body="mine"), body), 8, seed=1)
-    assert (motion.body, motion.model) == ("mine", body) and motion.joints().isfinite().all()
+    continued = model.continue_(Motion.of(duet.replace(body="mine"), body), 8, seed=1)
+    for motion in (continued, model.generate(frames=8, body=body, seed=1)):
+        assert (motion.body, motion.model) == ("mine", body) and motion.joints().isfinite().all()
 
 
 def test_what_cannot_be_done_is_named(model: Model, duet: Scene):
