@@ -102,7 +102,7 @@ def slots_of(name: str, agents: int | Sequence[int], count: int, has: str = "the
     Raises:
         ValueError: no whole numbers, or no such slot.
     """
-    several = agents if isinstance(agents, Sequence) else (agents,)
+    several: Any = (agents,) if isinstance(agents, Integral) else agents
     require_wholes(name, several)
     if strange := [agent for agent in several if not 0 <= agent < count]:
         raise ValueError(f"{name} {strange[0]}: {f'{has} 0 to {count - 1}' if count else 'nobody is in the scene'}")
