@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -296,6 +297,16 @@ def regular(path: Path) -> Path:
         what = "a folder" if path.is_dir() else "a pipe, a socket or a device"
         raise Refused(f"{path}: is {what}, expected a file; copy the file itself there")
     return path
+
+
+def said_sign(line: str) -> str | None:
+    """The sign between a table's columns, where its first line says it to spreadsheets; None: it says something else.
+
+    >>> said_sign("sep=;\\n"), said_sign("frame;person\\n")
+    (';', None)
+    """
+    match = re.fullmatch(r'"?sep=(.)"?[,;\t]*\s*', line, re.IGNORECASE)
+    return match[1] if match else None
 
 
 def inside(folder: Path, name: Any) -> Path:

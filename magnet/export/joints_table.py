@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
-from magnet.files import regular
+from magnet.files import regular, said_sign
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
 """A joint's name, an axis, and perhaps a unit: left_hip_x_m, LeftHip.X, nose_y (mm)."""
@@ -59,13 +59,16 @@ def read_table(path: str | Path) -> JointTable:
         first = file.readline()
         if "\0" in first:
             raise ValueError(f"{path}: is no text in UTF-8; save it again as CSV UTF-8")
-        file.seek(0)
-        sign = max(",;\t", key=first.count)
+        said = said_sign(first)
+        above = int(said is not None)  # lines before the names
+        if not above:
+            file.seek(0)
+        sign = said or max(",;\t", key=first.count)
         lines = csv.reader(file, delimiter=sign)
         try:
-            numbered = [(lines.line_num, row) for row in lines if any(map(str.strip, row))]
+            numbered = [(lines.line_num + above, row) for row in lines if any(map(str.strip, row))]
         except csv.Error as error:
-            raise ValueError(f"{path}, line {lines.line_num}: {error}; write it again as a table") from error
+            raise ValueError(f"{path}, line {lines.line_num + above}: {error}; write it again as a table") from error
     at_line, rows = [line for line, _ in numbered], [row for _, row in numbered]
     if len(rows) < 2:
         raise ValueError(f"{path}: holds no rows under a line of names")

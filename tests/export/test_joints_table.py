@@ -108,6 +108,17 @@ def test_numbers_may_have_decimal_commas_between_semicolons(tmp_path: Path) -> N
     assert found.fps == 25.0 and found.at[:, 0, 0].tolist() == [[1.5, 2, 3], [4, 5, -0.25]]
 
 
+@pytest.mark.parametrize("first", ["sep=;", '"sep=;"', "SEP=;", "\ufeffsep=;", "sep=;;;;"])
+def test_the_line_that_tells_spreadsheets_the_sign_is_no_line_of_names(first: str, tmp_path: Path) -> None:
+    lines = ["time;a_x;a_y;a_z", "0,00;1,5;2;3", "0,04;4;5;-0,25"]
+    found = read_table(table(tmp_path / "a.csv", first, *lines))
+    assert found.fps == 25.0 and found.at[:, 0, 0].tolist() == [[1.5, 2, 3], [4, 5, -0.25]]
+    bars = read_table(table(tmp_path / "b.csv", "sep=|", *(line.replace(";", "|") for line in lines)))
+    assert bars.at.tolist() == found.at.tolist()
+    with pytest.raises(ValueError, match=r"a\.csv, line 4: 2 cells, fewer than names"):
+        read_table(table(tmp_path / "a.csv", first, *lines[:2], "0,04;4"))
+
+
 def test_frames_that_are_counted_in_steps_are_the_files_frames(tmp_path: Path) -> None:
     found = read_table(
         table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *(f"{t},{t / 50},1,2,3" for t in (10, 15, 25)))

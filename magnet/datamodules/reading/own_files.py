@@ -12,6 +12,7 @@ from pathlib import Path
 
 from magnet.datamodules.reading.fields import natural
 from magnet.datamodules.reading.recording import DataError
+from magnet.files import said_sign
 
 TABLE = "people.csv"
 """The table that is taken without being named, where it lies in the folder."""
@@ -195,17 +196,19 @@ def _rows(table: Path) -> list[tuple[int, dict[str, str]]]:
         raise DataError(f"{table}: no such file; give a CSV with the columns {', '.join(COLUMNS)}") from error
     except (OSError, ValueError) as error:
         raise DataError(f"{table}: cannot be read as text ({error}); save it as CSV in UTF-8") from error
-    first = lines[0] if lines else ""
-    mark = max(",;\t", key=first.count)
+    said = said_sign(lines[0]) if lines else None
+    above = int(said is not None)  # lines before the columns' names
+    first = lines[above] if len(lines) > above else ""
+    mark = said or max(",;\t", key=first.count)
     head = [word.strip().lower() for word in next(csv.reader([first], delimiter=mark), [])]
     strange, lacking = sorted(set(head) - set(COLUMNS)), [name for name in NEEDED if name not in head]
     if strange or lacking or len(set(head)) < len(head):
         raise DataError(
-            f"{table}, line 1: the columns are {', '.join(head) or 'none'}; expected {', '.join(NEEDED)}, and of "
-            "person, role and start those that you want: mend it"
+            f"{table}, line {1 + above}: the columns are {', '.join(head) or 'none'}; expected {', '.join(NEEDED)}, "
+            "and of person, role and start those that you want: mend it"
         )
     found = []
-    for number, line in enumerate(lines[1:], 2):
+    for number, line in enumerate(lines[1 + above :], 2 + above):
         words = [word.strip() for word in next(csv.reader([line], delimiter=mark), [])]
         if not any(words):
             continue

@@ -108,6 +108,8 @@ def test_a_table_tells_people_roles_and_when_they_begin(tmp_path: Path) -> None:
         ("scene,file\ntango,/etc/a.bvh\n", r"line 2: /etc/a\.bvh lies outside"),
         ("scene,file\ntango,a.txt\n", r"line 2: a\.txt is no \.bvh file"),
         ("scene,file\ntango,a.bvh\nwaltz,a.bvh\n", r"line 3: a\.bvh is named in line 2 already"),
+        ("sep=;\nscene;file\ntango;a.bvh\nwaltz;a.bvh\n", r"line 4: a\.bvh is named in line 3 already"),
+        ("sep=;\nscene;shoes\n", r"line 2: the columns are scene, shoes"),
         ("scene,file,start\ntango,a.bvh,soon\n", r"line 2: start is 'soon', expected seconds"),
         ("scene,file,start\ntango,a.bvh,nan\n", r"line 2: start is 'nan', expected seconds"),
     ],
