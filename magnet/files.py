@@ -320,6 +320,16 @@ def inside(folder: Path, name: Any) -> Path:
     return folder / name
 
 
+def suffixed(path: str | Path, suffix: str) -> Path:
+    """The path with a suffix, behind whatever its name ends in: a name may have points of its own.
+
+    >>> suffixed("my.model.v2", ".npz").name, suffixed("dance.NPZ", ".npz").name
+    ('my.model.v2.npz', 'dance.NPZ')
+    """
+    path = Path(path)
+    return path if path.suffix.lower() == suffix else path.with_name(path.name + suffix)
+
+
 def npz_path(path: str | Path, others: str) -> Path:
     """The path of an npz, with its suffix where there is none.
 

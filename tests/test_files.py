@@ -11,8 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from magnet import files
+from magnet.body import load_body
+from magnet.evaluation.submission import Submission
+from magnet.export import save_bvh, save_csv, save_glb, save_smplx
+from magnet.export.motion import NotebookView
+from magnet.export.trace import DenoisingTrace
 from magnet.files import (
     CannotWrite,
     inside,
@@ -25,6 +31,7 @@ from magnet.files import (
     write_whole,
     writing,
 )
+from magnet.testing import random_scene
 
 HERE = "choose another --out"
 
@@ -235,3 +242,32 @@ def test_arrays_of_any_size_that_hold_something_are_read(tmp_path: Path) -> None
     for array in (np.arange(2**23), np.zeros(2**24, dtype=np.uint8)):  # 64 MiB of numbers; packed not at all
         np.savez(tmp_path / "plain.npz", array=array)
         assert load_npz(tmp_path / "plain.npz")["array"].nbytes == array.nbytes
+
+
+NAME = "my.model.v2"
+
+
+def written_by_each(folder: Path) -> dict[str, Path]:
+    """What each writer makes of a name with points, by its suffix; all but those that need other programs."""
+    generator = torch.Generator().manual_seed(0)
+    scene, body = random_scene(1, 8, 1, generator), load_body("open")
+    window = scene.slice(0, 4)
+    trace = DenoisingTrace(scene, torch.zeros(1, 2, 1, dtype=torch.int16), torch.zeros(1, dtype=torch.long), window)
+    joints = torch.zeros(1, 1, 4, 1, 22, 3)
+    return {
+        "trace": trace.save(folder / NAME),
+        "submission": Submission("b", "t", "m", ("one",), joints).save(folder / "1" / NAME, 30.0),
+        "npz": save_smplx(scene, folder / "2" / NAME, body)[0],
+        "csv": save_csv(scene, folder / NAME, body),
+        "glb": save_glb(scene, folder / NAME, body),
+        "bvh": save_bvh(scene, folder / NAME, body)[0],
+        "page": NotebookView(b"", ".html").save(folder / NAME),
+    }
+
+
+def test_a_name_keeps_what_stands_behind_its_points(tmp_path: Path) -> None:
+    written = written_by_each(tmp_path)
+    assert [path.name for path in written.values()] == [
+        f"{NAME}{suffix}" for suffix in (".npz", ".npz", ".npz", ".csv", ".glb", ".bvh", ".html")
+    ]
+    assert all(path.is_file() for path in written.values())

@@ -46,6 +46,6 @@ def main(arguments: Sequence[str] = ()) -> int:
     model = DenoiserCore.load(path)
     if options.without_posterior:
         model.posterior = None
-    for file, off in save_onnx(model, out, path.stem).items():
+    for file, off in save_onnx(model, out, path.name.removesuffix(".ckpt")).items():
         print(f"written: {file} ({file.stat().st_size / 1e6:.1f} MB, opset {OPSET}, off by {off:.1g} from torch)")
     return 0

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     from magnet.cli.train import quiet
     from magnet.evaluation.benchmark import Benchmark, BenchmarkTakes, write_inputs
     from magnet.evaluation.submission import Submission
-    from magnet.files import require_place
+    from magnet.files import require_place, suffixed
 
     for out in filter(None, (given.inputs, given.example, given.out / "table" if given.files else None)):
         require_place(out)
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     data.prepare_data()
     benchmark.check(data)
     if given.inputs is not None:
-        written = write_inputs(benchmark, data, given.task, given.inputs.with_suffix(".npz"))
+        written = write_inputs(benchmark, data, given.task, suffixed(given.inputs, ".npz"))
         print(f"written: {written}, not to be passed on: it holds recordings")
     if given.example is not None:
         print(f"written: {example(given, benchmark, data)}")
@@ -101,7 +101,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
         denoiser = DenoiserCore.load(told(given.method, found, "--method"))
         method = methods.model(denoiser, task, data, samples, SamplerOptions.preset(given.sampler))
     names, joints = answered(data, method, samples, given.seed)
-    made = Submission(benchmark.label, given.task, Path(given.method).stem, tuple(names), joints)
+    made = Submission(benchmark.label, given.task, Path(given.method).name.removesuffix(".ckpt"), tuple(names), joints)
     return made.save(given.example, benchmark.fps)
 
 

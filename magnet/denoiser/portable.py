@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from magnet.denoiser.core import DenoiserCore
-from magnet.files import write_whole
+from magnet.files import suffixed, write_whole
 from magnet.motion.scene import FPS
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
 from magnet.sampling.noise import LEVELS, alpha_bar
@@ -125,7 +125,7 @@ def save_onnx(denoiser: DenoiserCore, path: str | Path, name: str = "") -> dict[
         ImportError: onnx, onnxruntime or onnxscript is missing.
         ValueError: a model that cannot be exported, or whose file computes something else.
     """
-    path = Path(path).with_suffix(".onnx")
+    path = suffixed(path, ".onnx")
     layout, N, P = denoiser.layout, denoiser.window, denoiser.layout.agents
     generator = torch.Generator().manual_seed(0)
     noisy = torch.randn(2, N, P, layout.width, generator=generator)

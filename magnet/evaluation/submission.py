@@ -18,7 +18,7 @@ from magnet.evaluation.benchmark import Benchmark
 from magnet.evaluation.plausible import doubts, require_people
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import TRAINING, TRUTH, UNALIGNED, Scoring, generators_of
-from magnet.files import load_npz, save_npz
+from magnet.files import load_npz, save_npz, suffixed
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 KEYS = ("benchmark", "task", "method", "fps", "scenes", "joints")
@@ -57,8 +57,8 @@ class Submission:
         return self.joints[chosen].transpose(0, 1).to(scene.device)
 
     def save(self, path: str | Path, fps: float) -> Path:
-        """Write it as npz."""
-        path = Path(path).with_suffix(".npz")
+        """Write it as npz. Returns the path written, with that suffix."""
+        path = suffixed(path, ".npz")
         arrays: dict[str, Any] = {
             "benchmark": self.benchmark,
             "task": self.task,

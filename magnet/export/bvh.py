@@ -14,7 +14,7 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.joints import HEAD, L_FOOT, L_WRIST, PARENTS, R_FOOT, R_WRIST
 from magnet.export.bones import Names, bone_names
-from magnet.files import write_text
+from magnet.files import suffixed, write_text
 from magnet.motion.required import require_body, require_one
 from magnet.motion.scene import Scene
 
@@ -62,9 +62,10 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
     people = scene.people()
     if not people.scenes:
         raise ValueError("nobody is present in the scene, so there is no skeleton to write")
-    path = Path(path)
     written = []
-    for p, each in enumerate(paths_of(path.with_suffix(".bvh"), scene.present[0].nonzero()[:, 0].tolist())):
+    for p, each in enumerate(
+        paths_of(suffixed(path, ".bvh").with_suffix(".bvh"), scene.present[0].nonzero()[:, 0].tolist())
+    ):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)

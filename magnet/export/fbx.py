@@ -13,7 +13,7 @@ from pathlib import Path
 from magnet.body import Body
 from magnet.export.bones import BoneOptions
 from magnet.export.glb import save_glb
-from magnet.files import whole
+from magnet.files import suffixed, whole
 from magnet.motion.scene import Scene
 
 AS_FBX, AS_GLB = (Path(__file__).with_name(name) for name in ("as_fbx.py", "as_glb.py"))
@@ -50,7 +50,7 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         ValueError: what `save_glb` refuses, or Blender's own words where it fails.
     """
     blender()
-    path = Path(path) if Path(path).suffix.lower() == ".fbx" else Path(path).with_suffix(".fbx")
+    path = suffixed(path, ".fbx")
     with tempfile.TemporaryDirectory() as folder:
         as_fbx(save_glb(scene, Path(folder) / "scene.glb", body, bones), path, scene.fps)
     return path

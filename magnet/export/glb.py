@@ -16,7 +16,7 @@ from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, Names, bone_names
 from magnet.export.drawing import AGENTS
-from magnet.files import whole
+from magnet.files import suffixed, whole
 from magnet.motion.frames import canonical_frame, inverse
 from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import to_quat
@@ -69,7 +69,7 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
             gltf.document["animations"].append(clip)
     if bones.clips == "scene":
         gltf.document["animations"].append(scene_clip)
-    path = Path(path) if Path(path).suffix.lower() == ".glb" else Path(path).with_suffix(".glb")
+    path = suffixed(path, ".glb")
     with whole(path) as part:
         part.write_bytes(gltf.packed())
     return path

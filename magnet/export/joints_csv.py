@@ -7,7 +7,7 @@ from pathlib import Path
 
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
-from magnet.files import whole
+from magnet.files import suffixed, whole
 from magnet.motion.scene import Scene
 
 COLUMNS = ("scene", "frame", "time_s", "person", *(f"{name}_{axis}_m" for name in JOINT_NAMES for axis in "xyz"))
@@ -26,7 +26,7 @@ def save_csv(scene: Scene, path: str | Path, body: Body) -> Path:
     >>> len(table), table[1].split(",")[:4]  # a line of names, then 8 frames of 2 people
     (17, ['0', '0', '0.000000', '0'])
     """
-    path = Path(path) if Path(path).suffix.lower() == ".csv" else Path(path).with_suffix(".csv")
+    path = suffixed(path, ".csv")
     with whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)

@@ -17,7 +17,7 @@ from torch import Tensor
 from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole
 from magnet.export import formats
-from magnet.files import whole
+from magnet.files import suffixed, whole
 from magnet.motion.scene import Scene
 
 Player = Literal["page", "film"]
@@ -126,7 +126,7 @@ class NotebookView:
 
     def save(self, path: str | Path) -> Path:
         """Write it to a file, for a browser. Returns the path written."""
-        path = Path(path).with_suffix(self.kind)
+        path = suffixed(path, self.kind)
         with whole(path) as part:
             part.write_bytes(self.data)
         return path

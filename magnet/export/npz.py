@@ -27,7 +27,7 @@ from magnet.export.smpl_keys import (
     rotations,
 )
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
-from magnet.files import load_npz, save_npz
+from magnet.files import load_npz, save_npz, suffixed
 from magnet.motion.frames import rigid
 from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -85,8 +85,7 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
         "body": np.array(scene.body),
         "name": np.array(scene.names[0] if scene.names else ""),
     }
-    path = Path(path)
-    path = path if path.suffix.lower() == ".npz" else path.with_suffix(".npz")
+    path = suffixed(path, ".npz")
     if not apart:
         save_npz(path, arrays | facts)
         return [path]

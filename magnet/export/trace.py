@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.files import load_npz, save_npz
+from magnet.files import load_npz, save_npz, suffixed
 from magnet.motion.scene import Scene, cat_time, require_rotations
 
 FORMAT = 1
@@ -54,8 +54,8 @@ class DenoisingTrace:
         return cat_time([front, window])
 
     def save(self, path: str | Path) -> Path:
-        """Write one npz that needs no unpickling. Returns the path written."""
-        path = Path(path).with_suffix(".npz")
+        """Write one npz that needs no unpickling. Returns the path written, with that suffix."""
+        path = suffixed(path, ".npz")
         meta = {"recording": FORMAT, "fps": self.scene.fps, "body": self.scene.body, "names": list(self.scene.names)}
         arrays: dict[str, Any] = {name: value.cpu().numpy() for name, value in self.scene.tensors().items()}
         arrays["levels"], arrays["start"] = self.levels.numpy(), self.start.numpy()

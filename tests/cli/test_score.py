@@ -9,7 +9,7 @@ import pytest
 
 from magnet import cli
 from magnet.cli import outputs, score
-from magnet.evaluation import submission
+from magnet.evaluation import benchmark, submission
 from magnet.evaluation.results import Results
 
 
@@ -49,3 +49,19 @@ def test_the_tables_of_all_tasks_are_written_before_one_is_printed(
         score.show(score.parser().parse_args(["--out", str(tmp_path)]), None, None, [])
     assert capsys.readouterr().err == "magnet: a.npz: legs are 3 m long\n"
     assert all((tmp_path / task / "results.json").exists() for task in tables)
+
+
+def test_inputs_are_written_under_the_whole_name_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    class NoTakes:
+        def __init__(self, *words: object, **more: object) -> None: ...
+        def prepare_data(self) -> None: ...
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(benchmark, "BenchmarkTakes", NoTakes)
+    monkeypatch.setattr(benchmark.Benchmark, "check", lambda *words: None)
+    monkeypatch.setattr(benchmark, "write_inputs", lambda *words: words[-1])
+    for name, written in (("my.scenes.v2", "my.scenes.v2.npz"), ("scenes.npz", "scenes.npz")):
+        assert cli.main(["score", "--inputs", name]) == 0
+        assert f"written: {written}, not to be passed on" in capsys.readouterr().out
