@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
+from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 from magnet.cli.named_files import require_there
 from magnet.sampling.presets import PRESETS, preset_name
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run `magnet view`. Returns the exit code.
 
     Raises:
-        ValueError, OSError, ImportError: something the user can put right; the message says what.
+        CommandError, ValueError, OSError, ImportError: something the user can put right; the message says what.
     """
     options = arguments_of(arguments)
     _check(options)
@@ -110,7 +111,7 @@ def show_at_the_end(words: Sequence[str]) -> None:
     fail."""
     try:
         main(words)
-    except (ImportError, OSError, ValueError) as error:
+    except (CommandError, ImportError, OSError, ValueError) as error:
         print(f"not shown: {error}", file=sys.stderr)
         print(f"later: magnet view {shlex.join(words)}", file=sys.stderr)
 
