@@ -89,8 +89,10 @@ def main(arguments: Sequence[str]) -> int:
     """
     options = arguments_of(arguments)
     _check(options)
-    from magnet.files import require_place
+    from magnet.files import require_place, suffixed
 
+    if options.record is not None:
+        options.record = str(suffixed(options.record, ".npz"))  # as it is written, and read again to be shown
     for out in filter(None, (options.html, options.record)):
         require_place(out)
     if options.html is not None:

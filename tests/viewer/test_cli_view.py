@@ -231,6 +231,17 @@ def test_people_of_another_body_than_the_models_are_warned_of(
         assert (said in capsys.readouterr().out) == (body == "smplx-neutral")
 
 
+def test_steps_are_shown_from_where_they_were_recorded(tmp_path: Path, duet: Scene, capsys, monkeypatch) -> None:
+    """Also where no suffix was said, or a name with points."""
+    pytest.importorskip("viser")
+    monkeypatch.setattr(ViewerBase, "run", lambda _: None)
+    scene, model = str(duet.save(tmp_path / "a.npz")), str(trained_with("open-1", tmp_path / "a.ckpt"))
+    how = ("--context", "16", "--frames", "8", "--ckpt_path", model, "--steps", "1", "--port", "0", "--no_browser")
+    for name in ("steps", "my.steps.v2"):
+        assert main(["view", scene, "--record", str(tmp_path / name), *how]) == 0
+        assert f"written: {tmp_path / name}.npz" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("people", [(), ("--people", "2")])
 def test_people_from_nothing_have_the_body_that_is_given(people: tuple[str, ...], tmp_path: Path, monkeypatch) -> None:
     """The example couple has the open one, so that with another one plays from nothing too."""
