@@ -195,7 +195,7 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
             (["fit", "--model", "ToyModel", "--data.root"], "--data.root: got nothing, expected a value"),
             (
                 ["fit", "--model", "ToyModel", "--trainer.callbacks", "x"],
-                "callbacks: got x, expected a list such as [0,1] or a",
+                "no callback x; there are magnet.callbacks.NarrowCodes, ",
             ),
             (["predict", "--picture", "avi"], "--picture: got avi, expected mp4, gif, webp, none"),
             (
