@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from magnet import cli
-from magnet.cli.errors import explain
+from magnet.cli.errors import CommandError, explain
 from magnet.cli.run_numbers import require_numbers, too_large
 from magnet.sampling.options import SamplerOptions
 
@@ -66,9 +66,17 @@ def test_a_number_of_a_file_is_told_with_its_place_however_it_is_written(tmp_pat
         assert "error: mine.yaml, line 4: data.init_args.batch_size: got 1000000000.0" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("devices", ["auto", "1", "-1", 8, [0, 1], "0,1", None])
-def test_devices_that_can_be_are_taken(devices: Any) -> None:
-    require_numbers({"trainer": {"devices": devices}})
+def test_devices_that_can_be_are_taken_and_others_are_not() -> None:
+    def taken(devices: Any) -> bool:
+        try:
+            require_numbers({"trainer": {"devices": devices}})
+        except CommandError:
+            return False
+        return True
+
+    assert [each for each in ["auto", "1", "-1", 8, [0, 1], "0,1", None, "many", "-2", 4096] if not taken(each)] == [
+        "many", "-2", 4096
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
