@@ -15,7 +15,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from magnet.checkpoints import FOLDER
 from magnet.cli.errors import CommandError
@@ -182,7 +182,7 @@ def progress_bar(sampling: bool = False) -> ProgressBar:
 
 
 class ProgressLines(ProgressBar):
-    """Progress for logs: a line every `seconds`, with what is left, reckoned from the second step on.
+    """Progress for logs: a line every `seconds`, with what is left of that work, reckoned from its second step on.
 
     What the first step waits for, such as data that are read and weights that are packed, no other waits for.
 
@@ -190,8 +190,8 @@ class ProgressLines(ProgressBar):
         seconds: at least so much time between two lines.
     """
 
-    begun: tuple[float, int] | None
-    """When the first step ended, and how many were done then."""
+    begun: dict[str, tuple[float, int]]
+    """By what is done: when its first step ended, and how many were done then."""
 
     def __init__(self, seconds: float = 30.0) -> None:
         super().__init__()
@@ -202,20 +202,21 @@ class ProgressLines(ProgressBar):
         self.seconds = float("inf")
 
     def _start(self, *_: Any, **__: Any) -> None:
-        self.said, self.begun = time.monotonic(), None
+        self.said, self.begun = time.monotonic(), {}
 
     on_test_start = on_predict_start = _start
 
     def tell(self, what: str, done: int, total: float, more: str = "") -> None:
         """Print a line if it is time."""
         now = time.monotonic()
-        if done and self.begun is None:
-            self.begun = now, done
+        if done:
+            self.begun.setdefault(what, (now, done))
         if now - self.said < self.seconds or not done:
             return
         self.said, left = now, ""
-        if self.begun is not None and done > self.begun[1] and total != float("inf"):
-            left = f", {clock((now - self.begun[0]) * (total - done) / (done - self.begun[1]))} left"
+        begun, first = self.begun[what]
+        if done > first and total != float("inf"):
+            left = f", {clock((now - begun) * (total - done) / (done - first))} left"
         try:
             print(f"{what} {done}/{total:g}{left}{more}", flush=True)
         except BrokenPipeError:
@@ -241,12 +242,16 @@ class ProgressLines(ProgressBar):
 
 
 class SamplingProgress(ProgressBar):
-    """Progress of `test` and `predict` in denoising steps: one batch of scenes can take minutes."""
+    """Progress of `test` and `predict` in denoising steps, and of what `test` measures then, beside baselines.
+
+    One batch of scenes can take minutes with either.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.enabled = True
         self.bar: Progress | None = None
+        self.measures: TaskID | None = None
         self.lines = ProgressLines()
 
     def disable(self) -> None:
@@ -255,8 +260,9 @@ class SamplingProgress(ProgressBar):
     def _begin(self, what: str, batches: float, trainer: Trainer, model: Any) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
         plan = model.schedule(data.test.context_frames, data.test.horizon_frames)
-        self.what, self.done, self.total = what, 0, int(batches) * plan.evaluations
-        model.progress = self._advance
+        self.what, self.batches, self.done, self.total = what, int(batches), 0, int(batches) * plan.evaluations
+        self.measured, self.measures = 0, None
+        model.progress, model.measuring = self._advance, self._measured
         self.lines._start()
         if self.enabled and trainer.is_global_zero and sys.stdout.isatty():
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -270,6 +276,17 @@ class SamplingProgress(ProgressBar):
             self.bar.advance(self.task, steps)
         elif self.enabled:
             self.lines.tell(f"{self.what}: denoising step", self.done, self.total)
+
+    def _measured(self, each: int) -> None:
+        """each: answers and rows of a batch"""
+        self.measured += 1
+        what, total = f"{self.what}: measuring", self.batches * each
+        if self.bar is not None:
+            if self.measures is None:
+                self.measures = self.bar.add_task(what, total=total)
+            self.bar.advance(self.measures)
+        elif self.enabled:
+            self.lines.tell(what, self.measured, total)
 
     def _end(self, *_: Any, **__: Any) -> None:
         if self.bar is not None:

@@ -69,6 +69,7 @@ class Evaluator(L.LightningModule):
     Attributes:
         results: the table, once a test has ended.
         progress: told 1 after each denoising step.
+        measuring: after each method's answer to a batch, and each row of numbers, told how many of them a batch has.
         stats: consistency and cost of what was sampled.
 
     Raises:
@@ -95,6 +96,7 @@ class Evaluator(L.LightningModule):
         self.baseline_stride, self.interval = baseline_stride, interval
         self.results: Results | None = None
         self.progress: Callable[[int], None] | None = None
+        self.measuring: Callable[[int], None] | None = None
         self.stats, self.scenes = SamplingStats(), 0
         self.scoring: Scoring | None = None
         self.row = type(denoiser).__name__ if isinstance(denoiser, Peer) else MODEL
@@ -165,7 +167,7 @@ class Evaluator(L.LightningModule):
     def step(self, batch: Scene) -> None:
         """Measure every method on one batch of test scenes."""
         assert self.scoring is not None
-        self.scoring.step(batch, self._numbers(batch.scenes))
+        self.scoring.step(batch, self._numbers(batch.scenes), self.measuring)
         self.scenes += batch.scenes
 
     def finish(self) -> dict[str, Tensor]:

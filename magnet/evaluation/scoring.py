@@ -225,23 +225,42 @@ class Scoring:
             UNALIGNED[1]: of_scenes(RandomSample(train, aligned=False), draws=True),
         }
 
-    def step(self, batch: Scene, numbers: list[int]) -> None:
+    def step(self, batch: Scene, numbers: list[int], tell: Callable[[int], None] | None = None) -> None:
         """Measure every method on one batch of test scenes, which have these numbers in the whole test set.
 
         Methods see scenes as recorded. Only their predictions are moved into the world that all test scenes
         share, so that the choice of that world cannot tell anything about an unknown agent.
+
+        Args:
+            tell: after each method's answer, and each row of numbers, is told how many of them a batch has.
         """
+
+        def ready() -> None:
+            if tell is not None:
+                tell(len(self.methods) + len(self.metrics))
+
         answers = {}
         for name, method in self.methods.items():
             generators = generators_of(self.seed, numbers, self.samples, self.device)
             began = time.perf_counter()
             answers[name] = method(batch, self.samples, generators)
             self.seconds[name] += time.perf_counter() - began
+            ready()
         with torch.autocast(batch.device.type, enabled=False):  # half precision is for the network alone
-            self._measure(batch, answers, self.generated(batch), numbers)
+            self._measure(batch, answers, self.generated(batch), numbers, ready)
 
-    def _measure(self, batch: Scene, answers: dict[str, Tensor], scored: Tensor, numbers: list[int]) -> None:
-        """answers: (S, B, horizon, P, 22, 3) by method, scored (horizon, P) bool, numbers of the scenes"""
+    def _measure(
+        self,
+        batch: Scene,
+        answers: dict[str, Tensor],
+        scored: Tensor,
+        numbers: list[int],
+        ready: Callable[[], None],
+    ) -> None:
+        """answers: (S, B, horizon, P, 22, 3) by method, scored (horizon, P) bool, numbers of the scenes
+
+        ready: is called after each row.
+        """
         T_shared_world = shared_world(batch, self.now)
         future = self.body.joints(batch.slice(self.context).transformed(T_shared_world))
         units = torch.tensor([self.unit_of.get(name, -1) for name in batch.names or ("",) * batch.scenes])
@@ -252,10 +271,13 @@ class Scoring:
             # All else is as recorded: what is measured is how well one fits in.
             joints = torch.where(scored[..., None, None], joints, future)
             self.metrics[name].update(joints, future, batch.present, **here)
+            ready()
         self.metrics[TRUTH].update(future[None], future, batch.present, **here)
+        ready()
         if self.windows is not None:
             joints, found = self._instead(self.windows, batch, numbers)
             self.metrics[TRAINING].update(joints, future, batch.present & found[:, None], **here)
+            ready()
         names = batch.names or ("",) * batch.scenes
         self.measured += zip(numbers, names, units.tolist(), strict=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from magnet import cli
 from magnet.cli import run_folder
+from tests.evaluation.test_evaluator import data, prepared
 from tests.toys import ToyData, ToyModel
 
 FLAGS = {
@@ -48,6 +50,25 @@ def test_what_is_left_is_reckoned_from_the_second_step_on(
         lines.tell("test: denoising step", done, 64)
     said = capsys.readouterr().out.splitlines()
     assert said == ["test: denoising step 1/64", "test: denoising step 21/64, 0:01:26 left"]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_what_is_measured_after_sampling_is_counted_too(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A model and its truth, in each of three batches of three scenes."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    progress = run_folder.progress_bar(sampling=True)
+    progress.lines.seconds = 0.0
+    evaluator, trainer = prepared(baselines=False)
+    trainer.callbacks.append(progress)
+    trainer.test(evaluator, datamodule=data(), verbose=False)
+    said = capsys.readouterr().out
+    assert ("test: denoising steps" if terminal else "test: denoising step 1/") in said
+    if terminal:
+        assert re.search(r"test: measuring .*9/9", said)
+    else:
+        assert [f"{done}/9" for done in range(1, 10)] == re.findall(r"test: measuring (\d+/\d+)", said)
 
 
 def test_a_run_that_begins_in_the_same_second_gets_a_folder_of_its_own(tmp_path: Path) -> None:
