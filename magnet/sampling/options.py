@@ -12,7 +12,7 @@ from magnet.motion.neighbours import ENTER, LEAVE
 from magnet.motion.placement import Placement
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
-from magnet.sampling.presets import PRESETS, preset_fields
+from magnet.sampling.presets import preset_fields
 from magnet.sampling.solvers import Solver
 
 Separation = Literal["off", "light", "firm"]
@@ -151,8 +151,6 @@ class SamplerOptions:
             require_choice(name, getattr(self, name), known)
         for name in ("settle_blocks", "keep_given", "any_floor", "compile", "smooth_path", "requantize"):
             require_flag(name, getattr(self, name), unsaid=name in ("smooth_path", "requantize"))
-        if str(self.steps) in PRESETS:
-            raise ValueError(f"steps: got {self.steps!r}, a preset: SamplerOptions.preset({self.steps!r})")
         require_whole("steps", self.steps, 1, LEVELS)
         for name in ("stride", "turn"):
             if getattr(self, name) is not None:

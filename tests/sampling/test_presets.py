@@ -101,7 +101,7 @@ def test_the_python_interface_takes_a_preset_by_name():
     assert magnet.load("duet", sampler="paper", steps=7).sampler == SamplerOptions.preset("paper", steps=7)
     assert magnet.load("duet").sampler == SamplerOptions()
     assert magnet.Model(magnet.load("duet").denoiser, "paper").sampler == SamplerOptions.preset("paper")
-    with pytest.raises(ValueError, match=r"steps: got 'paper', a preset: SamplerOptions.preset\('paper'\)"):
+    with pytest.raises(ValueError, match="steps: got 'paper', expected a whole number, 1 to "):
         SamplerOptions("paper")
     with pytest.raises(ValueError, match="did you mean paper"):
         magnet.load("duet", sampler="paperr")
