@@ -191,12 +191,12 @@ class LiveApp(ViewerBase):
 
     def _add_model(self) -> None:
         gui, settings = self.server.gui, self.live.settings
-        slots = self.live.model.layout.agents
-        people = self.live.scene.agents
+        slots, people = self.live.model.layout.agents, self.live.scene.agents
         with gui.add_folder("Model"):
             task = gui.add_dropdown("task", tuple(registry.names()), initial_value=settings.task)
             about = gui.add_markdown("")
-            steps = gui.add_slider("denoising steps", min(2, asked := settings.steps), max(30, asked), 1, asked)
+            least, most = min(2, settings.steps), max(30, settings.steps)
+            steps = gui.add_slider("denoising steps", least, most, 1, settings.steps)
             kind = gui.add_dropdown("guidance", KINDS, initial_value=settings.guidance.kind)
             weight = gui.add_slider("weight", 0.0, 3.0, 0.1, settings.guidance.weight)
             smooth = gui.add_slider("smoothing", 0.0, 0.1, 0.01, settings.guidance.smooth, hint="smoother, and slower")
