@@ -30,6 +30,11 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
         "hip": ("upleg",), "knee": ("leg",), "ankle": ("foot",), "foot": ("toebase",), "collar": ("shoulder",),
         "shoulder": ("arm",), "elbow": ("forearm",), "wrist": ("fingerbase",), "neck": ("neck",), "head": ("head",),
     },
+    "VRM, Unity": {
+        "hip": ("upperleg",), "knee": ("lowerleg",), "ankle": ("foot",), "foot": ("toes", "toebase"),
+        "collar": ("shoulder",), "shoulder": ("upperarm",), "elbow": ("lowerarm",), "wrist": ("hand",),
+        "neck": ("neck",), "head": ("head",),
+    },
     "Mixamo, MotionBuilder": {
         "hip": ("upleg", "upperleg", "thigh"), "knee": ("leg", "lowleg", "lowerleg", "shin"), "ankle": ("foot",),
         "foot": ("toebase", "toe", "toes"), "collar": ("shoulder", "collar"), "shoulder": ("arm", "uparm", "upperarm"),

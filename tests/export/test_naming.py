@@ -125,6 +125,14 @@ def test_joints_are_recognised_by_the_names_of_programs(program: str) -> None:
     assert not {names[k] for k in right} & set(expected) and len(set(right)) == len(NEEDED)
 
 
+@pytest.mark.parametrize(
+    ("program", "scheme"),
+    [("VRM", "VRM, Unity"), ("VRoid", "VRM, Unity"), ("Mixamo", "Mixamo, MotionBuilder")],
+)
+def test_the_program_whose_names_they_are_is_told(program: str, scheme: str) -> None:
+    assert recognised(SKELETONS[program][0].split()).scheme == scheme
+
+
 def test_numbers_that_tell_joints_apart_stay() -> None:
     assert plain(["spine_01", "spine_02", "head", "thigh_l", "thigh_r"])[:2] == ["spine_01", "spine_02"]
     bare = ["hip", "knee", "ankle", "neck", "head"]
