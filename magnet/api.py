@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from magnet.body import Body, load_body
 from magnet.body.floor import open_body
 from magnet.checks import require_whole, slots_of
 from magnet.denoiser.core import DenoiserCore
+from magnet.errors import warn_user
 from magnet.export import reading
 from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
@@ -106,7 +106,7 @@ def read(
         raise ValueError(f"paths: got {type(strange[0]).__name__}, expected files' names, or lists of them")
     got = reading.read(files, body, options)
     for warning in reading.warned(got.notes):
-        warnings.warn(warning, stacklevel=2)
+        warn_user(warning)
     return Motion.of(got.scene, got.body, got.notes)
 
 
@@ -325,10 +325,10 @@ class Model:
         plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
         if bool((bad := given_invalid(plain, plan.known)).any()):
             first = int(bad.nonzero()[0])
-            warnings.warn(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid", stacklevel=2)
+            warn_user(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid")
         named = chosen.named(len(plan.known)) if isinstance(chosen, Inbetweening) else []
         if within := [step for step in named if 0 <= step * TOKEN_FRAMES < context]:
-            warnings.warn(f"context={context}: in it lie the keyframes at token steps {within}", stacklevel=2)
+            warn_user(f"context={context}: in it lie the keyframes at token steps {within}")
         made = self.sample(scene, chosen, context, frames, seed=seed, samples=samples, cond=cond)
         return Motion.of(completed(made.plain(), plain.to("cpu"), ~plan.finished), body)
 

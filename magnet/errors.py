@@ -1,6 +1,19 @@
-"""Errors that many rooms know: a file that somebody else made, and the end of the process."""
+"""Errors that many rooms know, a file that somebody else made and the end of the process; and how users are warned."""
 
 from __future__ import annotations
+
+import sys
+import warnings
+
+PACKAGE = __name__.partition(".")[0]
+
+
+def warn_user(message: str) -> None:
+    """Warn as of the line that called into this package, through however many of its functions it got here."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
 
 
 class DataError(ValueError):

@@ -6,7 +6,6 @@ import base64
 import html
 import inspect
 import tempfile
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from magnet.body import Body, load_body, on_floor
 from magnet.checks import require_whole
+from magnet.errors import warn_user
 from magnet.export import formats
 from magnet.files import suffixed, whole
 from magnet.motion.scene import Scene
@@ -76,7 +76,7 @@ class Motion(Scene):
             return super().save(path)
         written = formats.write(self.plain(), path, self._body(), **{"context_frames": self.context, **options})
         if others := formats.left_over_said(written):
-            warnings.warn(others, stacklevel=2)
+            warn_user(others)
         return written[0]
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from magnet.body.floor import MOMENTS, lowest, off_floor, open_body
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.token_core import TokenModelCore
+from magnet.errors import warn_user
 from magnet.export.misread import misread, steps_of
 from magnet.generation.conditioning import label
 from magnet.motion.required import require_rate
@@ -77,9 +77,9 @@ def other_body(model: TokenModelCore, body: str, data: bool = False) -> str | No
 
 
 def warn_of_body(model: DenoiserCore, scene: Scene) -> None:
-    """Warns whoever called a model's method where `other_body` says something."""
+    """Warns whoever uses a model where `other_body` says something."""
     if (said := other_body(model, scene.body)) is not None:
-        warnings.warn(said, stacklevel=3)
+        warn_user(said)
 
 
 def check_condition(cond: Tensor | None, scenes: int, weight: float) -> None:

@@ -312,6 +312,25 @@ def test_counts_that_are_none_are_named(numbers, message, model, duet):
         generate(model, duet, task, context, frames, samples, FAST)
 
 
+CALLS: dict[str, Callable[[Model, Scene], object]] = {
+    "generate": lambda own, scene: own.generate(frames=8),
+    "predict": lambda own, scene: own.predict(scene, context=CONTEXT, frames=8),
+    "continue_": lambda own, scene: own.continue_(scene, 8),
+    "inpaint": lambda own, scene: own.inpaint(scene),
+    "react": lambda own, scene: own.react(scene),
+    "partner": lambda own, scene: own.partner(scene),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_people_of_another_body_are_warned_of_at_the_line_of_the_user(call, duet):
+    model = tiny_denoiser(max_agents=2)
+    model.trained_body = "smplx-neutral"
+    with pytest.warns(UserWarning, match="trained with body 'smplx-neutral'") as caught:
+        CALLS[call](Model(model, FAST), duet)
+    assert [each.filename for each in caught] == [__file__]
+
+
 def test_a_model_that_was_never_trained_is_refused(duet):
     model = Denoiser(tokenizer="raw", network={"width": 16, "layers": 1, "heads": 2})
     with pytest.raises(ValueError, match="denoiser is not trained"):
