@@ -146,6 +146,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
     from magnet.agents.agent import Agent, Player
     from magnet.api import read
     from magnet.denoiser.core import DenoiserCore
+    from magnet.generation.inputs import other_body
     from magnet.sampling.options import SamplerOptions
     from magnet.tasks.agentic import AgenticAsync, AgenticSync
 
@@ -157,7 +158,10 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
     asked = {name: value for name in ("precision", "settle") if (value := getattr(given, name)) is not None}
     options = SamplerOptions(steps=given.steps, **asked)
     task = AgenticSync() if given.task == "agentic_sync" else AgenticAsync()
-    return Agent(DenoiserCore.load(given.model), start, names, given.name, task, options, given.seed)
+    model = DenoiserCore.load(given.model)
+    if said := other_body(model, start.body, "fixed"):
+        print(f"magnet: {said}", file=sys.stderr)
+    return Agent(model, start, names, given.name, task, options, given.seed)
 
 
 def take_part(given: argparse.Namespace, member: Member, link: Link, others: set[str]) -> None:

@@ -87,6 +87,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     from magnet.denoiser.core import DenoiserCore
     from magnet.evaluation import methods
     from magnet.evaluation.submission import Submission, answered
+    from magnet.generation.inputs import other_body
     from magnet.sampling.options import SamplerOptions
 
     task, name = benchmark.task(given.task), given.method.replace("_", " ")
@@ -99,6 +100,8 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     else:
         found = find_checkpoint(given.method, [Path("runs")], option="--method")
         denoiser = DenoiserCore.load(told(given.method, found, "--method"))
+        if said := other_body(denoiser, data.body.id, "fixed"):
+            print(f"magnet: {said}", file=sys.stderr)
         method = methods.model(denoiser, task, data, samples, SamplerOptions.preset(given.sampler))
     names, joints = answered(data, method, samples, given.seed)
     made = Submission(benchmark.label, given.task, Path(given.method).name.removesuffix(".ckpt"), tuple(names), joints)

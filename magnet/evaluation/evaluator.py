@@ -118,7 +118,7 @@ class Evaluator(L.LightningModule):
             )
         self.denoiser.require_tokenizer()
         require_float32_scenes(self.trainer.precision)
-        if said := other_body(self.denoiser, data.body.id, data=True):
+        if said := other_body(self.denoiser, data.body.id, "data"):
             rank_zero_warn(said)
 
     def on_test_start(self) -> None:

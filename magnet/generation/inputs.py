@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -57,19 +58,25 @@ def check_request(
     require_rate(scene)
 
 
-def other_body(model: TokenModelCore, body: str, data: bool = False) -> str | None:
+def other_body(model: TokenModelCore, body: str, people: Literal["files", "data", "fixed"] = "files") -> str | None:
     """Says that people have another body than those whom a model learned from; None: they have the same.
 
     Args:
         model: which may not know its body, and then nothing is said.
         body: the people's, its id.
-        data: they are of a data set, and not of files.
+        people: are of files, of a data set, or of what always has this body.
     """
     trained = model.trained_body
     if trained in (None, body):
         return None
-    file, none = ("--data.body_model FILE", "--data.body_model") if data else ("body=FILE, or --body FILE", "the body")
-    advice = f"leave {none} out" if trained == open_body().id else f"give its file: {file}"
+    if people == "fixed":
+        advice = "take a model that was trained with theirs"
+    else:
+        file, none = {
+            "files": ("body=FILE, or --body FILE", "the body"),
+            "data": ("--data.body_model FILE", "--data.body_model"),
+        }[people]
+        advice = f"leave {none} out" if trained == open_body().id else f"give its file: {file}"
     return (
         f"the model was trained with body {trained!r}, but these people have {body!r}, whose shape numbers mean "
         f"something else; {advice}"

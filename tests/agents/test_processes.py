@@ -345,3 +345,16 @@ def test_an_agent_who_hears_nobody_says_so(
     words = ["--name", "A", "--scene", str(folder / "two.npz"), "--model", str(folder / "model.ckpt")]
     assert agent.main([*words, "--listen", addresses_of("A")["A"]]) == 0
     assert "A runs alone, and hears nobody: --connect B=tcp://HOST:PORT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("trained", ["smplx-neutral", "open-1"])
+def test_an_agent_whose_model_learned_from_another_body_says_so(
+    trained: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = tiny_denoiser(max_agents=4, window=8)
+    model.trained_body = trained
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda _: model)
+    monkeypatch.setattr("magnet.cli.agent.take_part", lambda *_: None)
+    assert agent.main(["--name", "A", "--scene", str(folder / "two.npz"), "--listen", addresses_of("A")["A"]]) == 0
+    said = "magnet: the model was trained with body 'smplx-neutral', but these people have 'open-1', "
+    assert (said in capsys.readouterr().err) == (trained != "open-1")

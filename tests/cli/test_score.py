@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from magnet import cli
 from magnet.cli import outputs, score
 from magnet.evaluation import benchmark, submission
 from magnet.evaluation.results import Results
+from magnet.testing import tiny_denoiser
+from tests.datamodules.fakes import FakeData
 
 
 @pytest.mark.parametrize(
@@ -65,3 +68,18 @@ def test_inputs_are_written_under_the_whole_name_that_is_said(
     for name, written in (("my.scenes.v2", "my.scenes.v2.npz"), ("scenes.npz", "scenes.npz")):
         assert cli.main(["score", "--inputs", name]) == 0
         assert f"written: {written}, not to be passed on" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("trained", ["smplx-neutral", "open-1"])
+def test_an_example_by_a_model_that_learned_from_another_body_says_so(
+    trained: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    model, answer = tiny_denoiser(), torch.zeros(1, 1, 4, 2, 22, 3)
+    model.trained_body = trained
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda _: model)
+    monkeypatch.setattr("magnet.evaluation.methods.model", lambda *_: None)
+    monkeypatch.setattr(submission, "answered", lambda *_: (["a"], answer))
+    given = score.parser().parse_args(["--example", str(tmp_path / "out.npz"), "--method", "duet"])
+    score.example(given, benchmark.Benchmark.read(), FakeData([]))
+    said = "magnet: the model was trained with body 'smplx-neutral', but these people have 'open-1', "
+    assert (said in capsys.readouterr().err) == (trained != "open-1")
