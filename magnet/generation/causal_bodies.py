@@ -214,7 +214,7 @@ def decode_bodies(
     before = world.given.slice(first * TOKEN_FRAMES - 1, first * TOKEN_FRAMES) if first else None
     placed = world.rows_by_frame(world.placed[first:stop])
     there = torch.cat([placed, placed[-1:].expand(more * TOKEN_FRAMES, -1)])
-    require_finite(made, there)
+    require_finite(made, there, options.guidance)
     return freeze_after(made, there, before)
 
 

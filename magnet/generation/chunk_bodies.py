@@ -36,7 +36,7 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
         made = crossfade_given(made, given, T_world_can, world.rows_by_frame(known[low:high]), options.blend)
     made = made.slice((first - low) * TOKEN_FRAMES, (stop - low) * TOKEN_FRAMES)
     placed = world.placed[first:stop]
-    require_finite(made, world.rows_by_frame(placed))
+    require_finite(made, world.rows_by_frame(placed), options.guidance)
     if world.settle is not None:
         goes_on = placed.all(dim=0).to(tokens.device)
         seen = made.replace(present=made.present & goes_on)  # nobody makes way for whom nothing is known of

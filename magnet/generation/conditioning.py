@@ -13,6 +13,7 @@ from magnet.motion.frames import canonical_deltas, canonical_frame, pairwise, to
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token, pairwise_by_token
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks.base import Task, schedule_of
 from magnet.tokenizer.carried import Carried
@@ -50,11 +51,16 @@ def label(scene: Scene, number: int) -> str:
     return f"scene {number} ({scene.names[number]})" if scene.names else f"scene {number}"
 
 
-def require_finite(made: Scene, there: Tensor) -> None:
-    """Refuse bodies that a broken network made, before anything is built on them. there (T, P) bool, who is asked about
+def require_finite(made: Scene, there: Tensor, guidance: Guidance) -> None:
+    """Refuse bodies that are made by a broken network, or by too strong a guidance, before anything is built on them.
+
+    Args:
+        made: the bodies.
+        there: (T, P) bool, who is asked about.
+        guidance: with which they were made.
 
     Raises:
-        ValueError: NaN or infinities of somebody who is there; names scene and agent.
+        ValueError: NaN or infinities of somebody who is there; names scene and agent, and guidance that there was.
     """
     if bool((made.body_rot.sum() + made.T_world_root.sum()).isfinite()):  # one number tells of all
         return
@@ -62,8 +68,10 @@ def require_finite(made: Scene, there: Tensor) -> None:
     bad = (~finite & there & made.present[:, None]).any(dim=1)  # (B, P)
     if bool(bad.any()):
         b, agent = bad.nonzero()[0].tolist()
+        pushes = " and ".join(guidance.pushes())
+        blamed = f"{pushes} may be too strong: take less. Else its" if pushes else "Its"
         raise ValueError(
-            f"{label(made, b)}, agent {agent}: the model makes motion that is not finite (NaN or infinity). Its "
+            f"{label(made, b)}, agent {agent}: the model makes motion that is not finite (NaN or infinity). {blamed} "
             "weights are broken, or too large for the precision that it samples with: take an earlier checkpoint, or "
             "float32"
         )

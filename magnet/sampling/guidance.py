@@ -13,6 +13,8 @@ from magnet.motion.tokens import TokenLayout
 from magnet.sampling.noise import LEVELS, alpha_bar
 
 Kind = Literal["none", "history", "self", "partner"]
+MOST_AFTER = 1_000_000
+"""Token steps that are shown clean: a day and a half."""
 
 
 class DenoiseFn(Protocol):
@@ -69,7 +71,13 @@ class Guidance:
         for name in ("stabilization_level", "stabilization_beside", "stabilization_unseen"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 0, LEVELS - 1)
-        require_whole("stabilization_after", self.stabilization_after, 0)
+        require_whole("stabilization_after", self.stabilization_after, 0, MOST_AFTER)
+
+    def pushes(self) -> list[str]:
+        """What moves predictions away from what the network says, each with its strength, as `guidance.weight 1`."""
+        strengths = {"weight": 0.0 if self.kind == "none" else self.weight}
+        strengths |= {"smooth": self.smooth, "cond_weight": self.cond_weight}
+        return [f"guidance.{name} {strength:g}" for name, strength in strengths.items() if strength]
 
     def branches(self, there: Tensor) -> Tensor:
         """Whose history each branch sees, the unguided one first. Slots that are free in all scenes are left out.

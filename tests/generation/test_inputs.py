@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -19,8 +20,10 @@ from magnet.generation.partner import Partner
 from magnet.generation.rollout import generate, stream
 from magnet.generation.trace import record
 from magnet.motion.scene import Scene
+from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
+from magnet.tasks.agentic import AgenticSync
 from magnet.tasks.joint import Generation, JointFuture
 from magnet.tasks.partner import MotionControl, PartnerInpainting
 from magnet.testing import random_scene, tiny_denoiser
@@ -139,13 +142,26 @@ def test_weights_that_are_written_unseen_are_sampled_with(model, duet):
 
 def test_whoever_is_absent_or_not_yet_there_need_not_be_finite(duet):
     there = torch.ones(duet.frames, 2, dtype=torch.bool)
-    require_finite(duet, there)
+    require_finite(duet, there, Guidance())
     broken = with_roots(duet, 5, 1, math.nan)
     with pytest.raises(ValueError, match=r"^scene 0, agent 1: the model makes motion that is not finite"):
-        require_finite(broken, there)
-    require_finite(broken.replace(present=torch.tensor([[True, False]])), there)
+        require_finite(broken, there, Guidance())
+    require_finite(broken.replace(present=torch.tensor([[True, False]])), there, Guidance())
     there[5, 1] = False
-    require_finite(broken, there)
+    require_finite(broken, there, Guidance())
+
+
+@pytest.mark.parametrize("task", [JointFuture(), AgenticSync()])
+@pytest.mark.parametrize(
+    ("guidance", "blamed"),
+    [
+        (Guidance("history", weight=1e38), "guidance.weight 1e+38"),
+        (Guidance("partner", weight=1e38, smooth=1e38), "guidance.weight 1e+38 and guidance.smooth 1e+38"),
+    ],
+)
+def test_guidance_that_is_too_strong_is_blamed_before_the_weights(task, guidance, blamed, duet):
+    with pytest.raises(ValueError, match=re.escape(f"(NaN or infinity). {blamed} may be too strong: take less. Else")):
+        generate(tiny_denoiser(), duet, task, CONTEXT, FRAMES, 1, dataclasses.replace(FAST, guidance=guidance))
 
 
 @pytest.mark.parametrize("metres", [1.0, -1.0, 0.4])

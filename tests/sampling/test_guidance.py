@@ -134,6 +134,8 @@ def test_finished_tokens_are_shown_at_the_context_level_and_others_as_they_are(g
         Guidance("histry")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="stabilization_level: got 1000"):
         Guidance(stabilization_level=1000)
+    with pytest.raises(ValueError, match=r"stabilization_after: got 10+, expected 0 to 1000000"):
+        Guidance(stabilization_after=10**30)
 
 
 def test_given_tokens_are_shown_clean_beside_finished_ones_that_are_not(given):
