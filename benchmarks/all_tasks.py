@@ -22,7 +22,7 @@ from torch import Tensor
 from magnet.baselines.predictor import Generators
 from magnet.cli import run_folder
 from magnet.cli.provenance import machine, provenance
-from magnet.cli.train import quiet
+from magnet.cli.quiet import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser

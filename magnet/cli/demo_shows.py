@@ -14,7 +14,7 @@ from rich.console import Console
 from magnet import checkpoints
 from magnet.body import Body
 from magnet.cli import outputs, run_folder
-from magnet.cli.train import quiet
+from magnet.cli.quiet import quiet
 from magnet.datamodules.options import HeldOutScenes
 from magnet.datamodules.synthetic import Synthetic
 from magnet.denoiser.module import Denoiser

@@ -58,7 +58,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code: 1 where a cell could not be done."""
     given = parser().parse_args(list(arguments))
     from magnet.cli.provenance import machine, provenance
-    from magnet.cli.train import quiet, run_trainer
+    from magnet.cli.quiet import quiet
+    from magnet.cli.train import run_trainer
     from magnet.report.cells import BUDGETS, Store
     from magnet.report.page import page
     from magnet.report.plan import ReportOptions

@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     given = parser().parse_args(list(arguments))
     if not given.files and given.inputs is None and given.example is None:
         raise CommandError("nothing to score: name files, or write one with --example FILE; see magnet score --help")
-    from magnet.cli.train import quiet
+    from magnet.cli.quiet import quiet
     from magnet.evaluation.benchmark import Benchmark, BenchmarkTakes, write_inputs
     from magnet.evaluation.submission import Submission
     from magnet.files import require_place, suffixed

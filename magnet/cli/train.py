@@ -7,10 +7,8 @@ import dataclasses
 import importlib
 import io
 import itertools
-import logging
 import os
 import shlex
-import warnings
 from typing import Any, Literal
 
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning's calls, not ours
@@ -25,6 +23,7 @@ from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_fold
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.parser import Parser
+from magnet.cli.quiet import quiet
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
 from magnet.cli.run_numbers import require_numbers
 from magnet.cli.tasks import TaskChoice
@@ -54,19 +53,6 @@ EVERYTHING = {
     "predict": "seed of what has no seed of its own, and of samples where --seed is not said",
 }
 """What --seed_everything says in place of Lightning's text."""
-SILENCED = (
-    ".*does not have many workers.*",
-    ".*LeafSpec.*",
-    ".*logging interval.*",
-    ".*is not empty.*",
-    ".*callbacks used to create the checkpoint need to be provided.*",
-    ".*The dirpath has changed.*",
-    ".*in eval mode at the start of training.*",
-    ".*could not find the monitored key.*",  # before a validation; `run_folder.what_is_left` says so
-)
-"""Warnings of Lightning's that do not apply to this command."""
-UNSAID = ("Tip:", "`weights_only` was not set")
-"""Lines of its log that are left out; the second does not apply: our checkpoints are never unpickled."""
 
 
 def run_trainer(command: str, arguments: list[str]) -> int:
@@ -143,16 +129,6 @@ def path_of(classes: dict[str, str]) -> str:
     """Dotted path of the default class."""
     name, module = next(iter(classes.items()))
     return f"{module}.{name}"
-
-
-def quiet() -> None:
-    """Silence warnings that a user can do nothing about."""
-    for text in SILENCED:
-        warnings.filterwarnings("ignore", text)
-    for part in ("utilities.rank_zero", "trainer.connectors.checkpoint_connector"):
-        log = logging.getLogger(f"lightning.pytorch.{part}")
-        if not log.filters:
-            log.addFilter(lambda record: not any(text in record.getMessage() for text in UNSAID))
 
 
 class MagnetCLI(LightningCLI):

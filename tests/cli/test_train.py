@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from lightning.pytorch.trainer.connectors import checkpoint_connector
 
 from magnet import cli
 from magnet.cli import train
@@ -284,16 +283,6 @@ def test_results_are_written_as_json_and_csv(trained: Path, toy: Path) -> None:
     go("test", "--ckpt_path", "trained/checkpoints/last.ckpt", "--out", "tested")
     assert set(json.loads((toy / "tested" / "results.json").read_text())) == {"test/loss"}
     assert (toy / "tested" / "results.csv").read_text().startswith("metric,value\ntest/loss,")
-
-
-def test_what_does_not_apply_to_our_checkpoints_is_not_said(caplog: pytest.LogCaptureFixture) -> None:
-    """Lightning's own logger of the line about `weights_only`, wherever it makes it."""
-    train.quiet()
-    checkpoint_connector.log.addHandler(caplog.handler)
-    checkpoint_connector.log.warning("`weights_only` was not set, defaulting to `False`.")
-    checkpoint_connector.log.warning("something else")
-    checkpoint_connector.log.removeHandler(caplog.handler)
-    assert set(caplog.messages) == {"something else"}
 
 
 def test_curves_and_record_of_what_it_goes_on_with_are_kept(trained: Path, toy: Path) -> None:
