@@ -131,6 +131,11 @@ def path_of(classes: dict[str, str]) -> str:
     return f"{module}.{name}"
 
 
+def as_list(said: Any) -> list[Any]:
+    """What the Trainer takes alone or in a list, as a new list."""
+    return [*said] if isinstance(said, list | tuple) else [said] if said else []
+
+
 class MagnetCLI(LightningCLI):
     """LightningCLI for one command, with this project's order of precedence: flag, file, checkpoint, default."""
 
@@ -236,7 +241,7 @@ class MagnetCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A Trainer with this run's folder, logs, checkpoints and progress, unless options say otherwise."""
         config = self.config_init[self.command]["trainer"]
-        callbacks = list(config.get("callbacks") or [])
+        callbacks = as_list(config.get("callbacks"))
         fit = self.command == "fit"
         if fit and not config.get("fast_dev_run"):
             self.held.enter_context(own_folder.held(self.folder))
@@ -257,12 +262,10 @@ class MagnetCLI(LightningCLI):
             config["enable_checkpointing"] = False
         self.record = self._record()
         callbacks.append(self.record)
-        plugins = config.get("plugins") or []
-        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), CheckpointIO()]
         changes = {
             "callbacks": callbacks,
             "logger": logger or False,
-            "plugins": plugins,
+            "plugins": [*as_list(config.get("plugins")), CheckpointIO()],
             "precision": self._precision(config),
             "accelerator": accelerator_of(config.get("accelerator") or "auto"),
             "default_root_dir": config.get("default_root_dir") or str(self.folder),

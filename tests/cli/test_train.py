@@ -223,6 +223,12 @@ def test_samples_follow_the_seed_that_was_said_last(
     assert yaml.safe_load((toy / "made" / "config.yaml").read_text())["seed"] == seed
 
 
+def test_a_callback_may_stand_alone_in_place_of_a_list(toy: Path) -> None:
+    words = ("--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "1", "--out", "run")
+    go("fit", *words, "--trainer.callbacks", "RichModelSummary")
+    assert (toy / "run/checkpoints/last.ckpt").is_file()
+
+
 def test_the_configuration_of_a_run_repeats_it(trained: Path) -> None:
     go("fit", "--config", "trained/config.yaml", "--out", "again")
     first, again = (yaml.safe_load((Path(run) / "config.yaml").read_text()) for run in ("trained", "again"))
