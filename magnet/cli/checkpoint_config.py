@@ -122,27 +122,6 @@ class Arguments:
         return kept
 
 
-def import_named(given: Arguments) -> None:
-    """Import the classes that a user names by a dotted path, also out of the working directory.
-
-    Raises:
-        CommandError: such a module is there and cannot be imported.
-    """
-    from magnet.datamodules.registry import import_local
-
-    named = [(f"--{key}", given.class_of(key), key == "data") for key in ("model", "data")]
-    for layer in given.layers:
-        for key, part in layer.options.items():
-            classes = class_paths(part) if key != "task" else ()  # tasks have names of their own
-            named += [(layer.path or "a file", path, key == "data") for path in classes]
-    for where, path, data in named:
-        if path and "." in path:
-            try:
-                import_local(path, data)
-            except ValueError as error:
-                raise CommandError(f"{where} {error}") from error
-
-
 def find_checkpoint(
     name: str | None, folders: Iterable[Path], runs: Path | None = None, option: str = "--ckpt_path"
 ) -> Path:

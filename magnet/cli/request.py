@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magnet import checkpoints
-from magnet.cli import checkpoint_config, class_options, config_files, going_on, nested, run_folder
+from magnet.cli import checkpoint_config, class_options, config_files, going_on, nested, own_classes, run_folder
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
@@ -71,7 +71,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
         CommandError: something the user can put right.
     """
     given = Arguments.split(arguments)
-    checkpoint_config.import_named(given)
+    own_classes.import_named(given)
     if doubtful := registry.doubtful():
         given.flags = class_options.spelt_out_flags(given.flags, doubtful)
         for each in given.layers:
