@@ -101,7 +101,7 @@ def answered(arguments: Sequence[str] | None = None) -> int:
             return CLOSED
         return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
     except KeyboardInterrupt:
-        return complain("interrupted", 130)
+        return complain(arguments[0], "interrupted", 130)
     except Exception as error:
         if isinstance(error, BrokenPipeError) and output_closed():
             return CLOSED
@@ -109,7 +109,7 @@ def answered(arguments: Sequence[str] | None = None) -> int:
         message = (too_large(arguments) if overflow else None) or explain(error)
         if debug or message is None:
             raise
-        return complain(message + unquoted(arguments))
+        return complain(arguments[0], message + unquoted(arguments))
 
 
 @contextmanager
@@ -190,6 +190,7 @@ def usage() -> str:
     return USAGE.format(commands="\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()))
 
 
-def complain(message: str, code: int = 2) -> int:
-    print(f"magnet: error: {message}", file=sys.stderr)
+def complain(command: str, message: str, code: int = 2) -> int:
+    """Print an error as the parsers do, with the command before it where there is such a one. Returns the exit code."""
+    print(f"magnet{f' {command}' if command in COMMANDS else ''}: error: {message}", file=sys.stderr)
     return code

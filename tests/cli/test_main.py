@@ -221,6 +221,8 @@ def test_a_mistake_is_answered_by_what_would_be_right(
 ) -> None:
     said = complaint(capsys, *arguments)
     assert message in said and len(said.splitlines()) == 1
+    command = f"magnet {arguments[0]}" if arguments[0] in COMMANDS else "magnet"
+    assert said.startswith(f"{command}: error: ")
     assert not (toy / "runs").exists()
 
 
@@ -232,7 +234,7 @@ def test_options_that_a_class_refuses_are_told_in_its_own_words(
 
     monkeypatch.setattr(toys.LightningDataModule, "__init__", refuse)
     error = complaint(capsys, "fit", "--model", "ToyModel", "--trainer.accelerator", "cpu")
-    assert "magnet: error: takes: got 0, expected at least 1 (" in error and "subtypes" not in error
+    assert "magnet fit: error: takes: got 0, expected at least 1 (" in error and "subtypes" not in error
 
 
 def test_a_denoiser_without_a_tokenizer_is_refused_before_anything_is_written(

@@ -36,7 +36,7 @@ def test_a_second_training_in_a_folder_is_refused_while_the_first_one_works(
         assert other.stdout is not None and other.stdout.readline()
         assert cli.main(FIT) == 2
         told = capsys.readouterr().err.splitlines()[-1]
-        assert told == "magnet: error: another training is working in two; wait for it, or choose another --out"
+        assert told == "magnet fit: error: another training is working in two; wait for it, or choose another --out"
         assert [path.name for path in (toy / "two").iterdir()] == [own_folder.LOCK]
         other.communicate(b"\n")
     assert cli.main(FIT) == 0

@@ -302,7 +302,8 @@ def test_a_data_set_is_still_sampled_without_files() -> None:
 def test_an_option_of_files_without_files_says_what_to_name(option: str, capsys) -> None:
     assert cli.main(["predict", option, "20", "--samples", "2"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"magnet: error: {option.partition('=')[0]} goes with files") and "--people 2" in said
+    assert said.startswith(f"magnet predict: error: {option.partition('=')[0]} goes with files")
+    assert "--people 2" in said
     assert cli.main(["predict", option, "20", "--help"]) == 0, "help is never refused"
 
 

@@ -74,8 +74,8 @@ def test_a_task_of_a_tokenizer_is_refused_in_a_line(
     assert cli.main([*words.split(), "--ckpt_path", str(codes), "--out", "out", "--trainer.accelerator", "cpu"]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
     assert told == (
-        "magnet: error: --task joint_future: codes.ckpt holds a tokenizer, and tasks need a denoiser: name one with "
-        "--ckpt_path, or leave --task out"
+        f"magnet {words.split()[0]}: error: --task joint_future: codes.ckpt holds a tokenizer, and tasks need a "
+        "denoiser: name one with --ckpt_path, or leave --task out"
     )
     assert not (toy / "out").exists()
 
@@ -92,8 +92,8 @@ def test_options_of_sampling_of_a_tokenizer_are_refused_in_a_line(
     assert cli.main([command, *words.split(), "--ckpt_path", str(codes), *cpu]) == 2
     option = words.replace("=", " ").split()[0]
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f"magnet: error: {option}: codes.ckpt holds a tokenizer, which samples nothing and has no use for it: name a "
-        f"denoiser with --ckpt_path, or leave {option} out"
+        f"magnet {command}: error: {option}: codes.ckpt holds a tokenizer, which samples nothing and has no use for "
+        f"it: name a denoiser with --ckpt_path, or leave {option} out"
     )
     assert not (toy / "out").exists()
 

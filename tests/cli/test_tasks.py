@@ -122,9 +122,9 @@ def test_a_task_whose_plan_fails_is_marked_and_named_in_a_line(
     listed = " ".join(printed(capsys).split())
     assert re.search(f"odd strange-tasks 3.1 P\\(odd\\) .*cannot be sampled: {said}", listed)
     assert listed.count("cannot be sampled") == 1
-    assert re.fullmatch(f"magnet: error: {said}.*\n", complaint(capsys, "show", "odd"))
+    assert re.fullmatch(f"magnet tasks: error: {said}.*\n", complaint(capsys, "show", "odd"))
     assert cli.main(["predict", "--task", "odd", "--people", "2", "--frames", "8", "--out", "new.npz"]) == 2
-    assert re.fullmatch(f"magnet: error: {said}.*\n", capsys.readouterr().err)
+    assert re.fullmatch(f"magnet predict: error: {said}.*\n", capsys.readouterr().err)
 
 
 def test_a_task_that_only_refuses_the_grid_is_not_marked(

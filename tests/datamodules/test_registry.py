@@ -193,8 +193,8 @@ def test_a_file_may_name_it_too_also_within_a_mixture(here: Path, capsys) -> Non
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Broken", "magnet: error: data set Broken failed to load: ImportError: no module named shoes\n"),
-        ("Nowhere", "magnet: error: no data Nowhere; there are Synthetic, "),
+        ("Broken", "magnet fit: error: data set Broken failed to load: ImportError: no module named shoes\n"),
+        ("Nowhere", "magnet fit: error: no data Nowhere; there are Synthetic, "),
     ],
 )
 @pytest.mark.parametrize("named_by", ["flag", "file"])
@@ -274,7 +274,7 @@ def test_a_module_that_is_wrong_is_told_from_one_that_is_not_there(text: str, me
     words = ["fit", "--model", "Tokenizer", "--data", "mine_of_mine.Mine"]
     assert cli.main(words) == 2
     said = capsys.readouterr().err
-    assert said.startswith("magnet: error: --data mine_of_mine.Mine: ") and message in said
+    assert said.startswith("magnet fit: error: --data mine_of_mine.Mine: ") and message in said
     (here / "mine_of_mine.py").unlink()
     sys.modules.pop("mine_of_mine", None)
     assert cli.main(words) == 2
