@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,8 +29,7 @@ from magnet.motion.scene import FPS, Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.precision import device_of
 from magnet.sampling.options import SamplerOptions
-from magnet.tasks import registry
-from magnet.tasks.base import Task
+from magnet.tasks.base import Task, task_of
 from magnet.tasks.inbetweening import Inbetweening
 
 __all__ = ["Model", "Motion", "NotebookView", "load", "read"]
@@ -305,7 +303,7 @@ class Model:
         Raises:
             ValueError: no such task, or a scene it makes no sense on; says what to do.
         """
-        kind = registry.get(task)
+        chosen = task_of(task, fields)
         plain, body = _with_its_body(scene)
         warn_of_body(self.denoiser, plain)
         slots = scene.agents
@@ -317,11 +315,6 @@ class Model:
             frames = scene.frames - context
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
-        known = [field.name for field in dataclasses.fields(kind)]
-        if strange := [name for name in fields if name not in known]:
-            has = f"it has {', '.join(known)}" if known else "it has none"
-            raise ValueError(f"task {task} has no field {strange[0]}; {has}")
-        chosen: Task = kind(**fields)
         plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
         if bool((bad := given_invalid(plain, plan.known)).any()):
             first = int(bad.nonzero()[0])

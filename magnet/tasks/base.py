@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from magnet.plugins import attempted, told
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid, MaskSchedule
-from magnet.tasks.registry import name_of
+from magnet.tasks.registry import get, name_of
 
 SMALL = Grid(tokens=14, agents=2, context=4, steps=6, window=8, stride=4)
 """What a task is tried on, as `magnet tasks show` draws it."""
@@ -34,6 +36,24 @@ class Task(Protocol):
             ValueError: the task makes no sense on this grid (says why).
         """
         ...
+
+
+def task_of(name: str, said: Mapping[str, Any]) -> Task:
+    """A task by its name, with what is said of its fields.
+
+    Raises:
+        ValueError: no such task or field, with those that there are.
+    """
+    kind = get(name)
+    known = [each.name for each in dataclasses.fields(kind)]
+    for field in said:
+        if field not in known:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            of_sampling = field in ("sampler", *(each.name for each in dataclasses.fields(SamplerOptions)))
+            hint = "; how to sample is said of the model: magnet.load(name, sampler=...)" if of_sampling else ""
+            raise ValueError(f"task {name} has no field {field}; {has}{hint}")
+    task: Task = kind(**said)
+    return task
 
 
 def schedule_of(task: Task, grid: Grid) -> MaskSchedule:
