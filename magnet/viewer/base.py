@@ -181,9 +181,12 @@ class ViewerBase:
             button = gui.add_button("Download", icon="download")
 
         def save(event: Any) -> None:
-            view = self.views[names.index(which.value) if which is not None else 0]
             button.disabled = True
             try:
+                said = names[0] if which is None else which.value
+                if said not in names:  # viser passes on whatever a client sends
+                    raise ValueError(f"take: got {said!r}, expected {', '.join(names)}")
+                view = self.views[names.index(said)]
                 suffix, content = saved(view.take, self.body, kind.value, view.truth)
                 name = file_word(view.take.label) or "scene"
                 event.client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
