@@ -128,12 +128,15 @@ class CrowdViews:
         """table (P, slots - 1) int as `nearest_partners` has it, present (P,) bool, slots M of the model."""
         P, device = len(table), table.device
         if slots >= P:  # a small group is one view, with its slots as they are
-            groups, view = [tuple(range(P))], [0] * P
+            egos, view = {tuple(range(P)): 0}, [0] * P
         else:
             sets = [tuple(sorted({p, *row})) for p, row in enumerate(table.tolist())]
-            groups = list(dict.fromkeys(group for group, there in zip(sets, present.tolist(), strict=True) if there))
-            place = {group: number for number, group in enumerate(groups)}
+            egos = {}  # of each group, the first who is there
+            for p in present.nonzero()[:, 0].tolist():
+                egos.setdefault(sets[p], p)
+            place = {group: number for number, group in enumerate(egos)}
             view = [place.get(group, 0) for group in sets]
+        groups = list(egos)
         people = torch.tensor([[*group, *[0] * (slots - len(group))] for group in groups], device=device)
         taken = torch.tensor([[slot < len(group) for slot in range(slots)] for group in groups], device=device)
         in_view = torch.tensor(view, device=device)
@@ -147,5 +150,5 @@ class CrowdViews:
         meant = (table[:, :, None] == mine[:, None]) & taken[in_view][person[:, None], other[slot]][:, None]
         meant &= (table != person[:, None])[..., None]
         partner_slot = torch.where(meant.any(dim=-1), meant.int().argmax(dim=-1), -1)
-        ego = torch.tensor([view.index(number) for number in range(len(groups))], device=device)
+        ego = torch.tensor(list(egos.values()), device=device)
         return cls(people, taken & present[people], pair, in_view, slot, partner_slot, ego)

@@ -57,10 +57,11 @@ def test_wherever_somebody_absent_lies_nobody_else_has_other_partners(place: flo
     assert torch.equal(nearest_partners(ground, present, before, bonds), table)
 
 
+@pytest.mark.parametrize("absent", [0, 1])
 @pytest.mark.parametrize("people", [5, 17, 60])
-def test_everybody_is_read_from_a_view_with_the_own_partners(people: int) -> None:
+def test_everybody_is_read_from_a_view_with_the_own_partners(people: int, absent: int) -> None:
     ground, present, before, bonds = crowd(people, people**0.5, seed=people)
-    present[1] = False
+    present[absent] = False
     table = nearest_partners(ground, present, before, bonds)
     views = CrowdViews.of(table, present, 4)
     assert len(views.people) <= int(present.sum()), "no more views than people"
@@ -73,6 +74,8 @@ def test_everybody_is_read_from_a_view_with_the_own_partners(people: int) -> Non
             assert (b >= 0) == (q != p)
             if q != p:
                 assert views.people[v, partners(4)[a, b]] == q and views.pair[v, a, b] == s
+    for who, there, ego in zip(views.people, views.present, views.ego.tolist(), strict=True):
+        assert ego in who[there], "a view's ego is one of those in it"
 
 
 def test_a_small_group_is_one_view_as_it_is() -> None:
