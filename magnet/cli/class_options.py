@@ -155,13 +155,14 @@ def _replace(lower: Options, later: Options) -> None:
 def _replace_at(options: Options, path: list[str], value: str) -> None:
     """The same where a flag puts a whole value: `--trainer.callbacks`, `--data.data`."""
     old: Any = options
+    within: Any = options
     for name in path:
+        if not isinstance(old, dict):
+            return
         within = old if name in old else old.get("init_args")
         if not isinstance(within, dict) or name not in within:
             return
         old = within[name]
-        if name != path[-1] and not isinstance(old, dict):
-            return
     named = old.get("class_path") if isinstance(old, dict) else None
     if isinstance(old, list) or (isinstance(named, str) and not value.startswith("{") and not same_class(named, value)):
         del within[path[-1]]

@@ -262,3 +262,8 @@ def test_only_what_is_replaced_whole_is_taken_out() -> None:
     bare = {"data": {"class_path": "A", "init_args": {}}}
     assert settled([nested], "--data.data", "[]") == settled([nested], "--data.init_args.data=[]") == [bare]
     assert settled([nested], "--data.data.x", "1") == [nested]
+
+
+@pytest.mark.parametrize("path", ["--data.data", "--data.x.data", "--data.init_args.data"])
+def test_a_flag_of_a_class_that_a_file_only_names_takes_nothing_out_of_the_file(path: str) -> None:
+    assert settled([{"data": "Mixed"}], path, "[]") == [{"data": "Mixed"}]
