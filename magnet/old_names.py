@@ -216,19 +216,26 @@ def renamed_options(kind: str, options: Options) -> tuple[Options, dict[str, str
     return new, changed
 
 
-def renamed_flags(flags: Sequence[str]) -> tuple[list[str], dict[str, str | None]]:
-    """A command line with flags of the new names, and those that changed; a flag that is gone is left out."""
+def renamed_flags(flags: Sequence[str], model: str | None = None) -> tuple[list[str], dict[str, str | None]]:
+    """A command line with flags of the new names, and those that changed; a flag that is gone is left out.
+
+    Args:
+        flags: the words after the command.
+        model: the class that stands under `model`, where one is named; options of somebody's own class stay.
+    """
     new: list[str] = []
     changed: dict[str, str | None] = {}
+    kinds = {} if model is None else {"model": model.rpartition(".")[2]}
     rest = iter(flags)
     for flag in rest:
         name, equals, value = flag.partition("=")
         key, _, option = name.removeprefix("--").partition(".")
         option = option.removeprefix("init_args.")
-        if not name.startswith("--") or option not in OPTIONS.get(key, {}):
+        options = OPTIONS.get(kinds.get(key, key), {})
+        if not name.startswith("--") or option not in options:
             new.append(flag)
             continue
-        now = OPTIONS[key][option]
+        now = options[option]
         changed[name] = None if now is None else f"--{key}.{now}"
         if now is not None:
             new.append(f"--{key}.{now}{equals}{value}")

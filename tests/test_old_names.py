@@ -7,6 +7,7 @@ import torch
 import yaml
 
 from magnet import checkpoints
+from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import read_layers
 from magnet.denoiser.module import Denoiser
 from magnet.old_names import (
@@ -97,6 +98,25 @@ def test_old_flags_become_new_ones():
     new, changed = renamed_flags(flags)
     assert new == ["--model.network.width", "8", "--model.noise.shift=3", "--data.width", "8"]
     assert changed["--model.width"] == "--model.network.width" and changed["--model.std_floor"] is None
+
+
+@pytest.mark.parametrize(
+    ("model", "now"),
+    [
+        (["--model", "mine.Net"], "--model.width"),
+        (["--model.class_path=mine.Net"], "--model.width"),
+        (["--config", "net.yaml"], "--model.width"),
+        (["--model", "magnet.tokenizer.module.Tokenizer"], "--model.width"),
+        (["--model", "Denoiser"], "--model.network.width"),
+        ([], "--model.network.width"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, list) else words,
+)
+def test_a_flag_is_renamed_only_for_the_model_that_had_the_option(model, now, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.yaml").write_text("model: mine.Net\n")
+    given = Arguments.split([*model, "--model.width=64"])
+    assert given.flags[-1] == f"{now}=64"
 
 
 @pytest.mark.parametrize("kind", ["Denoiser", "Tokenizer"])

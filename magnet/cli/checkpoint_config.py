@@ -54,10 +54,10 @@ class Arguments:
                 found.files.append(value if equals else next(rest, ""))
             else:
                 found.flags.append(argument)
-        found.flags, changed = renamed_flags(one_class(found.flags))
+        found.layers = [layer for file in found.files for layer in read_layers(file)]
+        found.flags, changed = renamed_flags(one_class(found.flags), found.class_of("model"))
         if changed:
             print(f"magnet: {told(changed)}", file=sys.stderr)
-        found.layers = [layer for file in found.files for layer in read_layers(file)]
         return found
 
     @property
