@@ -13,10 +13,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.crowd_room import SMOOTHED, room_made
 from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settled_groups, settled_moments
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
+from magnet.generation.inputs import check_condition
 from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import CHUNK, Rollout
 from magnet.generation.separation import Decode
@@ -71,6 +73,8 @@ def generate_crowd(
     Raises:
         ValueError: as `generate`; or somebody's start is not known, or the options or the task are not for crowds.
     """
+    require_whole("samples", samples, 1)
+    check_condition(cond, scene.scenes, 0)  # of all scenes; each rollout gets that of its own, with the weight
     model, made = denoiser_of(model), []
     for number in range(scene.scenes * samples):
         which = [number // samples]

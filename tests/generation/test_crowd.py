@@ -332,3 +332,12 @@ def test_somebody_given_who_may_be_far_away_makes_nobody_s_past_faint(model: Den
         return generate_crowd(model, scene, task(target=(0, 1), own_past=True), 16, 32, 1, options, generator)
 
     assert torch.equal(made(None).T_world_root, made(700).T_world_root)
+
+
+@pytest.mark.parametrize("people", [2, 6])
+@pytest.mark.parametrize("cond", [torch.zeros(3, 5), torch.zeros(1, 5), [[0.0] * 5] * 2], ids=["more", "fewer", "list"])
+def test_conditions_are_one_tensor_with_one_for_each_scene(people: int, cond: Any) -> None:
+    told = tiny_denoiser(max_agents=4, window=8, network={"cond_dim": 5})
+    scenes = random_scene(2, 16, people, torch.Generator().manual_seed(0))
+    with pytest.raises(ValueError, match="cond: got"):
+        generate_crowd(told, scenes, registry.get("joint_future")(), 8, 8, 1, QUICK, seeded(), cond=cond)
