@@ -191,7 +191,8 @@ def told(scene: Scene, body: Body) -> str:
     speed = float(slide[low].mean()) if bool(low.any()) else 0.0
     there = scene.present[:, None] & counts[..., None]
     foot = joints[..., FEET, 1].amin(dim=-1)[there]
-    over = [(limit, 100 * float((worst[counts] > limit / 100).float().mean())) for limit in (5, 10)]
+    worst = worst[counts]
+    over = [(limit, 100 * float((worst > limit / 100).float().mean())) for limit in (5, 10)]
     shares = ", ".join(f"{share:.1f} % over {limit} cm" for limit, share in over)
     air, under = (100 * float(share.float().mean()) for share in (foot > 0.06, foot < -0.02))
     return (
@@ -249,7 +250,7 @@ def drawn(before: Mapping[str, Tensor], after: Mapping[str, Tensor], fps: float)
     for row, title in enumerate(before):
         top = GAP + row * (HEIGHT + GAP)
         values = torch.cat([before[title], after[title]])
-        most = float(values[values.isfinite()].max()) or 1.0  # of nothing at all, a line at 0
+        most = float(values.nan_to_num(0).clamp_min(0).max()) or 1.0  # of nothing over 0, a line at 0
         parts.append(f'<text x="{LEFT}" y="{top - 8}">{title}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + 10}" text-anchor="end">{most:.3g}</text>')
         parts.append(f'<text x="{LEFT - 6}" y="{top + HEIGHT}" text-anchor="end">0</text>')

@@ -153,6 +153,29 @@ def test_a_step_out_of_frames_that_are_not_valid_is_none(crowded: Scene) -> None
     assert told(scene.replace(T_world_root=away, valid=valid), body) == told(scene.slice(5), body)
 
 
+def test_people_in_each_other_where_frames_are_not_valid_are_not_told(crowded: Scene) -> None:
+    scene = crowded.slice(0, 20)
+    apart = scene.T_world_root.clone()
+    apart[:, 5:, 0, 0, 3] += 5.0
+    valid = torch.ones(1, 20, dtype=torch.bool)
+    valid[:, :5] = False
+    assert told(scene.replace(T_world_root=apart, valid=valid), load_body()).startswith("deepest 0.0 cm")
+
+
+@pytest.mark.parametrize(
+    ("values", "points"),
+    [([torch.nan] * 3, []), ([-2.0, -1.0, torch.nan], [["162.0"] * 2] * 2), ([0.0], [["162.0"]] * 2)],
+)
+def test_what_counts_nowhere_or_is_under_the_floor_is_drawn_at_the_bottom(
+    values: list[float], points: list[list[str]]
+) -> None:
+    made = {"highest lower foot, cm": torch.tensor(values)}
+    picture = drawn(made, made, 30.0)
+    lines = re.findall(r'<polyline points="([^"]*)"', picture)
+    assert [[point.partition(",")[2] for point in line.split()] for line in lines] == points
+    assert re.findall(r'text-anchor="end">([^<]*)<', picture) == ["1", "0"]
+
+
 def test_a_picture_shows_every_measure_over_time_before_and_after(crowded: Scene, tmp_path: Path) -> None:
     scene, plot = crowded.slice(0, 40).save(tmp_path / "crowded.npz"), tmp_path / "over_time.svg"
     assert cli.main(["refine", str(scene), str(tmp_path / "out.npz"), "--poses", "keep", "--plot", str(plot)]) == 0
