@@ -71,7 +71,8 @@ class DenoiserCore(TokenModelCore):
     ) -> None:
         super().__init__()
         require_choice("target", target, Target)
-        require_whole("max_agents", max_agents, most=MOST_SLOTS)
+        require_whole("max_agents", max_agents, 1, MOST_SLOTS)
+        require_whole("window", window, 1)
         self.network, self.noise = group_of(TransformerOptions, network), group_of(NoiseOptions, noise)
         self.loss, self.self_forcing = group_of(DenoiserLoss, loss), group_of(SelfForcing, self_forcing)
         self.optimizer, self.sampling = group_of(OptimizerOptions, optimizer), group_of(Sampling, sampling)

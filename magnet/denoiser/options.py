@@ -62,6 +62,11 @@ class TransformerOptions:
     def __post_init__(self) -> None:
         for name in ("width", "layers", "heads", "mlp_ratio", "level_width", "agent_width", "slot_width"):
             require_whole(name, getattr(self, name), 1)
+        for name in ("level_width", "slot_width"):
+            if getattr(self, name) % 2:
+                raise ValueError(
+                    f"{name}: got {getattr(self, name)}, expected an even number, as sines and cosines are"
+                )
         for name in ("causal_block", "cond_dim"):
             require_whole(name, getattr(self, name), 0)
         for name in ("dropout", "cond_dropout"):

@@ -26,7 +26,7 @@ HUGE = "99999999999999999999999"
             "window_frames: got 4000000, expected at most 1,000,000",
         ),
         ("fit --model Tokenizer --data.test.horizon_frames 4000000", "horizon_frames: got 4000000, expected at most"),
-        ("fit --model Denoiser --data.max_agents 9999", "max_agents: got 9999, expected at most 1000"),
+        ("fit --model Denoiser --data.max_agents 9999", "max_agents: got 9999, expected 1 to 1000"),
         (f"fit --model Tokenizer --data.scene_seed {HUGE}", f"scene_seed: got {HUGE}, expected -1000000000000 to"),
         ("fit --model Tokenizer --seed_everything -5", "--seed_everything -5: expected 0 to 4294967295"),
         ("fit --model Tokenizer --seed_everything 4294967296", "4294967296: expected 0 to 4294967295"),

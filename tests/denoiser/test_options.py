@@ -46,6 +46,21 @@ def test_every_task_runs_with_every_option(model: Denoiser, scene: Scene, name: 
     assert torch.equal(made.T_world_root[made.given], scene.slice(0, 40).T_world_root[made.given])
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"max_agents": 0}, "max_agents: got 0, expected 1 to 1000"),
+        ({"max_agents": -1}, "max_agents: got -1, expected 1 to 1000"),
+        ({"window": 0}, "window: got 0, expected at least 1"),
+        ({"network": {"level_width": 7}}, "level_width: got 7, expected an even number"),
+        ({"network": {"slot_width": 7}}, "slot_width: got 7, expected an even number"),
+    ],
+)
+def test_sizes_that_no_model_can_have_are_refused_before_it_is_built(options: dict, said: str):
+    with pytest.raises(ValueError, match=said):
+        tiny_denoiser(**options)
+
+
 def test_options_come_back_with_a_checkpoint(model: Denoiser, tmp_path):
     from tests.denoiser.test_module import save
 
