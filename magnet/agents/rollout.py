@@ -154,9 +154,7 @@ class OwnRollout(Rollout):
             if stop and stop < local * TOKEN_FRAMES:
                 low = max(stop - 1 - PACE, 0)
                 one = world.given.slice(low, local * TOKEN_FRAMES).permute_agents(slot)
-                self._show(
-                    stop, slot, carried_on(one, torch.ones(1, dtype=torch.bool), stop - 1 - low).slice(stop - low)
-                )
+                self._show(stop, slot, carried_on(one, one.present[0], stop - 1 - low).slice(stop - low))
 
     def _show(self, frame: int, slot: Tensor, motion: Scene) -> None:
         """Somebody's body is this from some frame on. slot (1,), motion (1, f, 1)"""

@@ -131,7 +131,7 @@ def with_limb(key: Keyframe, limb: str, place: Tensor, body: Body, betas: Tensor
 def with_keyframes(scene: Scene, keys: Iterable[Keyframe]) -> Scene:
     """A scene (B = 1) in which people are as their keyframes say, marked as given there."""
     roots, body_rot = scene.T_world_root.clone(), scene.body_rot.clone()
-    given = torch.zeros(roots.shape[:3], dtype=torch.bool) if scene.given is None else scene.given.clone()
+    given = roots.new_zeros(roots.shape[:3], dtype=torch.bool) if scene.given is None else scene.given.clone()
     for key in keys:
         frames = slice(key.frame, key.frame + TOKEN_FRAMES)
         roots[0, frames, key.agent] = key.T_world_root()

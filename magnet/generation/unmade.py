@@ -52,5 +52,5 @@ def given_invalid(scene: Scene, known: Tensor) -> Tensor:
     frames = min(scene.frames, known.shape[0] * TOKEN_FRAMES)
     if scene.valid is None:
         return torch.zeros(frames, dtype=torch.bool)
-    read = known.repeat_interleave(TOKEN_FRAMES, dim=0)[:frames] & scene.present.any(dim=0)
+    read = known.to(scene.device).repeat_interleave(TOKEN_FRAMES, dim=0)[:frames] & scene.present.any(dim=0)
     return (~scene.valid[:, :frames]).any(dim=0) & read.any(dim=1)

@@ -252,6 +252,7 @@ def test_a_keyframe_holds_four_frames_of_motion_wherever_it_is_put(live: Live) -
     there = with_keyframes(scene, [key])
     torch.testing.assert_close(there.T_world_root, scene.T_world_root, atol=1e-5, rtol=0)
     assert there.given[0].nonzero().tolist() == [[t, 1] for t in range(40, 44)]
+    assert with_keyframes(scene.replace(given=None).to("meta"), [key]).given.device.type == "meta", "or a GPU's"
     moved = dataclasses.replace(keyframe(scene, 1, 40, pose=10), goal=Goal(3.0, -1.0, 0.5))
     root = with_keyframes(scene, [moved]).T_world_root[0, 40:44, 1]
     heading = canonical_frame(root[:, None])[0, 0]

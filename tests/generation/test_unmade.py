@@ -33,3 +33,5 @@ def test_given_frames_that_are_not_valid_are_found_and_others_do_not_matter() ->
     valid = torch.ones(2, 24, dtype=torch.bool)
     valid[1, [5, 9, 18]] = False
     assert given_invalid(scene.replace(valid=valid), known).nonzero()[:, 0].tolist() == [5, 18]
+    elsewhere = scene.replace(valid=valid).to("meta")  # as a GPU's: a plan's steps are on the CPU
+    assert given_invalid(elsewhere, known).device.type == "meta"
