@@ -218,8 +218,10 @@ class Process:
         member = self.member
         if self._running:
             self._gather(GATHER)
-            there, far = self._there(), sum(map(self._far_on, self._running))
-            if there > 2 if self.real_time else far >= min(2, len(self._running)):
+            there = self._there()
+            begun = sum(map(self._far_on, self._running)) >= min(2, len(self._running))
+            late = there > 2 if self.real_time else begun
+            if late:
                 member.join(there + 1)
                 self.report.joined = member.next
         self.pace = Pace(self.clock() + PERIOD, member.next)

@@ -178,15 +178,15 @@ class Parser(LightningArgumentParser):
             short = [flag for flag, after in behind if flag.startswith(bare[1]) and after.startswith("--")]
             return f"{(short or [bare[1]])[0]}: got nothing, expected a value behind it"
         unknown = re.search(r"[Uu]nrecognized arguments: (\S+)", message)
-        refused = re.search(REFUSED, message)
+        no_such = re.search(REFUSED, message)
         if unknown and not unknown[1].startswith("-"):
             meant = [f"--{key} {unknown[1]}" for key, classes in self.classes.items() if unknown[1] in classes]
             hint = f"did you mean {meant[0]}?" if meant else "options are written --NAME VALUE"
             return f"got {unknown[1]}, expected an option; {hint}"
-        if unknown or refused:
-            said = unknown[1].partition("=")[0] if unknown else refused[1] if refused else ""
+        if found := unknown or no_such:
+            said = found[1].partition("=")[0]
             name = self._written(said.lstrip("-"), said)
-            if refused and not unknown and (told := self._unknown_in_files(said)):
+            if not unknown and (told := self._unknown_in_files(said)):
                 return told
             return f"no option {name}{self._had_by_others(name) or closest(name, self._flags())}"
         required = re.search(r"(?:required.*?|Key \")\b(model|data)\b", message)

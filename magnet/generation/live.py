@@ -93,7 +93,7 @@ class Live:
         generator: source of all randomness.
 
     Attributes:
-        keys: keyframes that `between` goes through; those of people who are gone are dropped.
+        keys: keyframes that `between` goes through; `begin` drops them.
         asked: whether the next chunk is to be made `between` the keyframes.
 
     Raises:

@@ -50,7 +50,7 @@ class Inbetweening:
         """All keyframes as (agent, token step).
 
         Raises:
-            ValueError: no such agent or token step, agents beside nothing but pairs, or nothing is left to generate.
+            ValueError: no such agent or token step, or agents beside nothing but pairs.
         """
         require_whole("every", self.every, 1)
         require_wholes("keys", self.keys)
