@@ -9,8 +9,10 @@ import re
 import secrets
 import shutil
 import tempfile
+import tokenize
 import unicodedata
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -352,6 +354,10 @@ def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(file, **arrays)
 
 
+DAMAGED = (EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
+"""What reading a damaged npz raises besides `ValueError`: of its archive, its packed numbers, its arrays' heads."""
+
+
 def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:
     """Open an npz without pickles, unless it unpacks to far more than its size.
 
@@ -362,7 +368,7 @@ def load_npz(path: str | Path, names: Collection[str] | None = None) -> Any:
     Raises:
         FileNotFoundError: no such file.
         Refused: not a file, or an array that would unpack to more than 64 MiB and 100 times its packed size.
-        zipfile.BadZipFile: not an npz.
+        zipfile.BadZipFile: not an npz; of a damaged one, and when its arrays are read, any of `DAMAGED`.
     """
     with zipfile.ZipFile(regular(Path(path))) as archive:
         for member in archive.infolist():

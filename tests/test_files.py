@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import resource
+import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +18,11 @@ import torch
 
 from magnet import files
 from magnet.body import load_body
+from magnet.evaluation.benchmark import Benchmark
 from magnet.evaluation.submission import Submission
 from magnet.export import save_bvh, save_csv, save_glb, save_smplx
 from magnet.export.motion import NotebookView
+from magnet.export.npz import read_smplx
 from magnet.export.trace import DenoisingTrace
 from magnet.files import (
     CannotWrite,
@@ -31,7 +36,9 @@ from magnet.files import (
     write_whole,
     writing,
 )
+from magnet.motion.scene import Scene
 from magnet.testing import random_scene
+from magnet.viewer.takes import read_takes
 
 HERE = "choose another --out"
 
@@ -242,6 +249,61 @@ def test_arrays_of_any_size_that_hold_something_are_read(tmp_path: Path) -> None
     for array in (np.arange(2**23), np.zeros(2**24, dtype=np.uint8)):  # 64 MiB of numbers; packed not at all
         np.savez(tmp_path / "plain.npz", array=array)
         assert load_npz(tmp_path / "plain.npz")["array"].nbytes == array.nbytes
+
+
+def damaged(path: Path, how: str) -> Path:
+    """An npz with all of its arrays damaged in one way."""
+    data = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        names, places = archive.namelist(), [member.header_offset for member in archive.infolist()]
+    entries = [match.start() for match in re.finditer(b"PK\x01\x02", data)]  # of the list of members at its end
+    if how == "cut short":
+        del data[len(data) // 2 :]
+    elif how == "of another sum":
+        for entry in entries:
+            data[entry + 16] ^= 0xFF
+    elif how == "locked":
+        for entry in entries:
+            data[entry + 8] |= 1
+    elif how == "packed otherwise":
+        for place in places:
+            begin = place + 30 + sum(struct.unpack_from("<HH", data, place + 26))
+            data[begin : begin + 8] = b"\xff" * 8
+    path.write_bytes(data)
+    if how == "of no type":
+        with zipfile.ZipFile(path, "w") as archive:
+            for name in names:
+                archive.writestr(name, np.lib.format.magic(1, 0) + struct.pack("<H", 12) + b"{'descr': (\n")
+    return path
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "scene": Scene.load,
+    "trace": DenoisingTrace.load,
+    "npz": lambda path: read_smplx(path, load_body("open"), in_fps=30.0),
+    "submission": lambda path: Submission.load(path, Benchmark.read()),
+    "body": load_body,
+    "view": lambda path: read_takes([path]),
+}
+
+
+@pytest.mark.parametrize("how", ["cut short", "of another sum", "locked", "packed otherwise", "of no type"])
+@pytest.mark.parametrize("kind", READERS)
+def test_a_damaged_npz_is_told_as_one_by_whoever_reads_it(kind: str, how: str, tmp_path: Path) -> None:
+    written = written_by_each(tmp_path)
+    scene = random_scene(1, 8, 1, torch.Generator().manual_seed(0))
+    np.savez_compressed(tmp_path / "body.npz", v_template=np.random.default_rng(0).normal(size=(50, 3)))
+    written |= {"scene": scene.save(tmp_path / "scene.npz"), "body": tmp_path / "body.npz", "view": written["trace"]}
+    with pytest.raises(ValueError, match=re.escape(written[kind].name)):
+        READERS[kind](damaged(written[kind], how))
+
+
+@pytest.mark.parametrize("meta", ["5", '{"format": "later", "recording": "later"}'])
+@pytest.mark.parametrize("kind", ["scene", "trace", "view"])
+def test_an_npz_that_says_something_strange_of_itself_is_refused(kind: str, meta: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "strange.npz", meta=np.array(meta))
+    with pytest.raises(ValueError, match=r"strange\.npz"):
+        READERS[kind](tmp_path / "strange.npz")
 
 
 NAME = "my.model.v2"

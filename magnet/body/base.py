@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import math
 import zipfile
-import zlib
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 from magnet.body.family import body_files, family_of, title
 from magnet.body.joints import PARENTS
 from magnet.body.pickles import pickled_arrays
-from magnet.files import load_npz
+from magnet.files import DAMAGED, load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SHAPES = 10
@@ -261,7 +260,7 @@ def _npz_arrays(path: Path) -> tuple[dict[str, NDArray], set[str]]:
             for name in WANTED:
                 if name in there:
                     arrays[name] = file[name]
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, *DAMAGED) as error:
         at = f" at key {name!r}" if name else ""
         raise ValueError(
             f"{path}: not a readable body file{at} ({error}); expected SMPL-X's npz with plain numeric arrays "

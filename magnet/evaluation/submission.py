@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from magnet.evaluation.benchmark import Benchmark
 from magnet.evaluation.plausible import doubts, require_people
 from magnet.evaluation.results import Results
 from magnet.evaluation.scoring import TRAINING, TRUTH, UNALIGNED, Scoring, generators_of
-from magnet.files import load_npz, save_npz, suffixed
+from magnet.files import DAMAGED, load_npz, save_npz, suffixed
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 KEYS = ("benchmark", "task", "method", "fps", "scenes", "joints")
@@ -88,7 +87,7 @@ class Submission:
                     there = ", ".join(sorted(file.files)) or "nothing"
                     raise ValueError(f"{path}: lacks {', '.join(lacking)}; it has {there}. See docs/benchmark.md")
                 read = {key: _array(path, key, file) for key in KEYS}
-        except (EOFError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             raise ValueError(f"{path}: not a readable npz ({error}); write it with numpy.savez") from error
         names = tuple(map(str, np.atleast_1d(read["scenes"])))
         _require_facts(path, read, benchmark)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from magnet.export.smpl_keys import (
     rotations,
 )
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
-from magnet.files import load_npz, save_npz, suffixed
+from magnet.files import DAMAGED, load_npz, save_npz, suffixed
 from magnet.motion.frames import rigid
 from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import from_rotvec, to_rotvec
@@ -274,7 +273,7 @@ def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, s
             name = str(file["name"]) if "name" in there else ""
             own = file[OWN_SHAPE] if written_for is not None and OWN_SHAPE in there else None
             given = file["given"] if written_for is not None and "given" in there else None
-    except (OSError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, *DAMAGED) as error:
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     arrays = {"poses": poses, "transl": transl, "betas": betas} | ({} if own is None else {OWN_SHAPE: own})
     bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from magnet.files import load_npz, save_npz, suffixed
+from magnet.files import DAMAGED, load_npz, save_npz, suffixed
 from magnet.motion.scene import Scene, cat_time, require_rotations
 
 FORMAT = 1
@@ -93,7 +93,7 @@ class DenoisingTrace:
                 body_rot=arrays["estimate_body_rot"].float(), T_world_root=arrays["estimate_T_world_root"], names=()
             )
             return DenoisingTrace(scene, arrays["levels"], arrays["start"], estimates)
-        except (OSError, KeyError, ValueError, EOFError) as error:
+        except (OSError, KeyError, TypeError, ValueError, *DAMAGED) as error:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(f"{path}: not a recording of denoising steps ({error})") from error

@@ -5,8 +5,6 @@ from __future__ import annotations
 import builtins
 import dataclasses
 import json
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ import torch
 from torch import Tensor
 
 from magnet.checks import require_number
-from magnet.files import load_npz, npz_path, save_npz
+from magnet.files import DAMAGED, load_npz, npz_path, save_npz
 
 BODY_JOINTS = 22
 """The pelvis and the 21 body joints of SMPL-X; hands and face are not modelled."""
@@ -245,9 +243,9 @@ class Scene:
             with load_npz(path) as file:
                 meta = json.loads(str(file["meta"]))
                 arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in TENSORS if name in file.files}
-            version = meta["format"]
+            version = int(meta["format"])
             arrays |= {"fps": meta["fps"], "body": meta["body"], "names": tuple(meta["names"])}
-        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except (OSError, KeyError, TypeError, ValueError, *DAMAGED) as error:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(f"{path}: not a scene file ({error}); write one with Scene.save") from error

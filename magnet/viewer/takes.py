@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from magnet.body.base import Body, load_body
 from magnet.export.page.takes import SAMPLES, ShownTake, take, takes
 from magnet.export.reading import Reading, read, shared
 from magnet.export.trace import DenoisingTrace
-from magnet.files import load_npz
+from magnet.files import DAMAGED, load_npz
 from magnet.motion.scene import Scene
 
 
@@ -73,7 +72,7 @@ def read_scene(path: Path, body: Body, options: Reading) -> tuple[Scene, Denoisi
     try:
         got = read(path, body, options)
         return got.scene, None, got.notes
-    except (KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, *DAMAGED) as error:
         raise ValueError(f"{path}: not readable as a scene ({error!r}); copy or download it again") from error
 
 
@@ -86,5 +85,5 @@ def is_trace(path: Path) -> bool:
     try:
         with load_npz(path) as file:
             return "meta" in file.files and "recording" in json.loads(str(file["meta"]))
-    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+    except (OSError, TypeError, ValueError, *DAMAGED) as error:
         raise ValueError(f"{path}: not readable ({error}); copy or download it again") from error
