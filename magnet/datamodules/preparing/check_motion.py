@@ -65,7 +65,7 @@ def usable(recording: Recording) -> Bools:
             f"people {lost}{called} are valid in none of {T} frames: never tracked, or the tracking mask means the "
             f"opposite; leave the take out"
         )
-    for name in ("poses", "transl", "positions"):
+    for name in ("poses", "transl", "pelvis", "positions"):
         array = getattr(recording, name)
         if array is not None and not (fine := np.isfinite(array).reshape(T, P, -1).all(axis=-1) | ~valid).all():
             frame, person = np.argwhere(~fine)[0].tolist()

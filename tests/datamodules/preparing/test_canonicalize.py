@@ -206,9 +206,11 @@ def test_lost_tracking_and_jumps_cut_a_take():
         )
 
 
-@pytest.mark.parametrize("field", ["poses", "transl", "betas"])
+@pytest.mark.parametrize("field", ["poses", "transl", "pelvis", "betas"])
 def test_nan_is_named(field):
     motion = recorded(people(40, 2))
+    if field == "pelvis":
+        motion = replace(motion, transl=None, pelvis=motion.transl)
     array = getattr(motion, field).copy()
     array[1, 1] = np.nan
     with pytest.raises(DataError, match=f"{field} holds? NaN"):
