@@ -164,7 +164,7 @@ class Film:
         known = frame < self.context_end
         scale = 2  # the bar alone is drawn larger and shrunk, for smooth ends
         upper = int(y - 8 * unit)
-        strip = page.crop((0, upper, page.width, upper + int(16 * unit)))
+        strip = page.crop((0, upper, page.width, upper + max(int(16 * unit), 1)))
         strip = strip.resize((strip.width * scale, strip.height * scale))
         draw = ImageDraw.Draw(strip)
         middle, half = strip.height / 2, 2.5 * unit * scale

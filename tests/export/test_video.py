@@ -14,7 +14,7 @@ from PIL import Image
 from magnet.body import Body
 from magnet.export import Camera, render_video
 from magnet.export.cast import STYLES, Style
-from magnet.export.drawing import AGENTS, CONTEXT, Canvas, plan_views, strokes
+from magnet.export.drawing import AGENTS, CONTEXT, SMALLEST, Canvas, Size, plan_views, require_size, strokes
 from magnet.export.video import Film
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -56,6 +56,12 @@ def test_a_file_holds_the_scenes_seconds_at_the_fps_asked_for(
     assert pixels_like(images[0], CONTEXT[0]) > 30
     assert pixels_like(images[-1], AGENTS[0]) > 30
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("size", [(SMALLEST, SMALLEST), (28, 28), (640, SMALLEST), (SMALLEST, 640)])
+def test_panels_of_every_size_that_is_not_refused_are_drawn(size: Size, duet: Scene, body: Body) -> None:
+    require_size(size)
+    assert film(duet, body, size=size).draw(0).size == size
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
