@@ -265,9 +265,12 @@ def _validator(headers: Message) -> str:
 
 def _extent(status: int, headers: Message) -> tuple[int, int | None]:
     """Where an answer begins and how long the whole file is."""
-    match = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", headers.get("Content-Range", "")) if status == 206 else None
-    if match:
-        return int(match[1]), int(match[2])
+    if status == 206:
+        said = headers.get("Content-Range", "")
+        match = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+|\*)", said)
+        if match is None:
+            raise http.client.HTTPException(f"a part of the file came that does not say which it is: {said!r}")
+        return int(match[1]), int(match[2]) + 1 if match[3] == "*" else int(match[3])  # all up to the end was asked for
     length = headers.get("Content-Length", "")
     return 0, int(length) if length.isdigit() else None
 

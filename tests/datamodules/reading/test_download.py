@@ -66,9 +66,8 @@ class Handler(BaseHTTPRequestHandler):
         stated = len(sent) + {"states more": 50, "states less": -50}.get(fault, 0)
         self.send_response(206 if start else 200)
         if start:
-            self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
-        if fault == "wrong range":
-            self.send_header("Content-Range", f"bytes {start + 7}-{len(body) - 1}/{len(body)}")
+            first, whole = start + 7 * (fault == "wrong range"), "*" if fault == "of any length" else len(body)
+            self.send_header("Content-Range", f"bytes {first}-{len(body) - 1}/{whole}" if fault != "no range" else "")
         self.send_header("ETag", "W/weak" if fault == "weak" else tag)
         self.send_header("Content-Length", str(stated))
         self.send_header("Connection", "close")
@@ -170,6 +169,8 @@ FAULTS = {
     "a page to log in": ["html"],
     "weak tag": ["weak", "drop"],
     "dropped, then another part": ["drop", "wrong range"],
+    "dropped, then a part of a file of any length": ["drop", "of any length"],
+    "dropped, then a part of which nothing is said": ["drop", "no range"],
 }
 
 
