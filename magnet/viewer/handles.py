@@ -29,6 +29,7 @@ from magnet.generation.keyframes import (
 )
 from magnet.generation.live import Live
 from magnet.motion.frames import canonical_frame
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.viewer.clock import Clock
 from magnet.viewer.people import PeopleView, add_people
 from magnet.viewer.worker import Worker
@@ -147,7 +148,7 @@ class KeyframePanel:
             add = gui.add_button("Add keyframe here", icon="plus")
             self.which = gui.add_dropdown("keyframe", (NO_KEYS,))
             hint = f"later than the last frame there is, too, by {LATER} at most"
-            self.at = gui.add_number("at frame", 0, min=0, step=4, hint=hint)
+            self.at = gui.add_number("at frame", 0, min=0, step=TOKEN_FRAMES, hint=hint)
             self.limb = LimbHandle(app.server, app.body, self._chosen_key, self._bent)
             remove = gui.add_button("Remove this keyframe", icon="minus")
             self.list = gui.add_markdown("")
@@ -224,7 +225,7 @@ class KeyframePanel:
         except ValueError:
             self.at.value = entry.key.frame
             raise
-        frame = max(int(wanted), 0) // 4 * 4
+        frame = max(int(wanted), 0) // TOKEN_FRAMES * TOKEN_FRAMES
         taken = any(e is not entry and (e.key.agent, e.key.frame) == (entry.key.agent, frame) for e in self.entries)
         if frame != entry.key.frame and not taken:
             self._change(entry, frame=frame)
@@ -232,7 +233,7 @@ class KeyframePanel:
 
     def _generate(self) -> None:
         start = self.live.between_from()
-        last = max(entry.key.frame for entry in self.entries) + 4
+        last = max(entry.key.frame for entry in self.entries) + TOKEN_FRAMES
         with self.live.lock:
             self.live.asked = True
         self.go.disabled = True
@@ -265,7 +266,8 @@ class KeyframePanel:
     def _pose(self, entry: KeyframeEntry) -> None:
         """Put the preview where the keyframe is."""
         first = dataclasses.replace(entry.key, agent=0, frame=0)
-        scene = self.live.scene.slice(0, 1).permute_agents(key_slot(entry.key)).pad_frames(4).slice(0, 4)
+        held = torch.zeros(TOKEN_FRAMES, dtype=torch.long)  # any poses will do: all are replaced
+        scene = self.live.scene.frames_at(held).permute_agents(key_slot(entry.key))
         turns, places = bone_poses(self.app.body, with_keyframes(scene, [first]).slice(0, 1))
         with self.app.server.atomic():
             entry.preview.pose(turns[0], places[0])

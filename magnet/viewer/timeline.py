@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magnet.export.page.palette import Colours, hexed, pale
 from magnet.motion.runs import true_runs
+from magnet.motion.tokens import TOKEN_FRAMES
 
 EDGE = 10
 """Pixels between the timeline and the edges of the picture."""
@@ -36,7 +37,7 @@ class Tracks:
     @property
     def frames(self) -> int:
         """Up to the last frame or keyframe."""
-        return max([len(self.known), *(frame + 4 for _, frame in self.keys)])
+        return max([len(self.known), *(frame + TOKEN_FRAMES for _, frame in self.keys)])
 
 
 def drawn(tracks: Tracks, now: int, fps: float) -> str:
@@ -58,8 +59,9 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
                 bar(start, stop, top, TRACK, hexed(colours[p]))
         for person, frame in tracks.keys:
             if person == p:
+                middle = frame + TOKEN_FRAMES / 2
                 parts.append(
-                    f'<svg x="{100 * (frame + 2) / frames:.2f}%" y="{top + TRACK / 2}" overflow="visible">'
+                    f'<svg x="{100 * middle / frames:.2f}%" y="{top + TRACK / 2}" overflow="visible">'
                     f'<path d="M0 -6L6 0L0 6L-6 0Z" fill="{KEY}" stroke="white"/></svg>'
                 )
     every = next((step for step in (1, 2, 5, 10, 30, 60, 300) if frames / fps / step <= 12), 600)  # some ten marks

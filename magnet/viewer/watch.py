@@ -12,6 +12,7 @@ from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import CROWD, Style, first_style
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length
 from magnet.export.trace import DenoisingTrace
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
 from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
@@ -28,8 +29,8 @@ def level_image(recording: DenoisingTrace, step: int) -> NDArray[np.uint8]:
     cells = (1 - noise) * agent_colours(tuple(range(P)))[:, None] + noise * 255.0
     image = np.kron(cells, np.ones((CELL, CELL, 1)))
     image[::CELL], image[:, ::CELL] = 214, 214
-    first = int(recording.start[step]) // 4
-    last = min(first + recording.estimates.frames // 4, N)
+    first = int(recording.start[step]) // TOKEN_FRAMES
+    last = min(first + recording.estimates.frames // TOKEN_FRAMES, N)
     image[:2, first * CELL : last * CELL] = image[-2:, first * CELL : last * CELL] = 60
     image[:, first * CELL : first * CELL + 2] = image[:, last * CELL - 2 : last * CELL] = 60
     return image.round().astype(np.uint8)
