@@ -13,7 +13,7 @@ from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
 from magnet.body.holding import holds, lasting_holds
 from magnet.body.indices import pairs_of
-from magnet.body.repair import repaired, settling
+from magnet.body.repair import STUBBORN, repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
 from magnet.generation.separation import Decode, open_body_on
 from magnet.motion.frames import posed
@@ -30,12 +30,10 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/experiments_corrections.md)."""
 
-LOOSELY = (
-    Settle(iterations=12, inner=120, bend=30.0, root=5.0, hold=2.0, hard=10.0),
-    Settle(iterations=16, inner=120, bend=5.0, root=3.0, hold=1.0, hard=40.0),
-)
-"""How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another. With fewer inner steps
-what is rounded otherwise in another batch moves people by a centimetre."""
+ANEW = (STUBBORN, replace(STUBBORN, root=0.3, hold=0.3, hard=200.0))
+"""How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another: smoothly, for who is
+thrown out of another within two frames is seen more than some centimetres of depth. The second moves whole people
+aside, and hands give way (docs/experiments_corrections.md, "Nobody is thrown")."""
 
 SHOWN = Settle(
     iterations=3,
@@ -71,7 +69,7 @@ REMEMBERED = 60
 CMU's salsa 9 are shorter."""
 
 REACH = 6
-"""Frames before and after a moment that is corrected more loosely."""
+"""Frames before and after a moment that is corrected anew."""
 
 LEFT, TOO_DEEP = Apart(body=0.07, arms=0.07), Apart(body=0.08, arms=0.08)
 """Metres of depth that `SHOWN` may leave, and `FINISHED`."""
@@ -197,7 +195,7 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     still = fixed[..., there.to(fixed.device)]
     offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
     made = corrected(shaped, offset)
-    for looser in LOOSELY:
+    for harder in ANEW:
         frames = left_deep(made, body, TOO_DEEP, still)
         deep = frames.any(dim=1)
         if not bool(deep.any()):
@@ -205,8 +203,8 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
         few = shaped.select(deep.nonzero()[:, 0])
         stay = still[deep] if still.ndim == 3 and len(still) == len(deep) else still
         past_few, held_few = (None if each is None else each[deep] for each in (before, holding))
-        loose = settling(few, body, how, stay, looser, begun, past_few, holding=held_few)
-        offset[deep] = torch.lerp(offset[deep], loose, around(frames[deep])[..., None, None].to(loose))
+        again = settling(few, body, how, stay, harder, begun, past_few, holding=held_few)
+        offset[deep] = torch.lerp(offset[deep], again, around(frames[deep])[..., None, None].to(again))
         made = corrected(shaped, offset)
     held = since_held(holds(body.joints(made), made.present)[0][:, -1:]) if how == "hold" else None
     body_rot, root = scene.body_rot.clone(), scene.T_world_root.clone()
