@@ -25,6 +25,10 @@ GOES_ON = 18
 """Frames in which people who were given come from the speed they had to the one predicted, and before a keyframe to
 that of the keyframe (docs/experiments_sampling.md)."""
 
+TAKES_UP = 24
+"""Frames in which people come from the speed that they had to the path that was made for them, after what was shown
+noisily (docs/experiments_sampling.md, "Where one stride meets the next")."""
+
 EASES_IN = 4
 """Frames in which a token made live comes from the speed of the one before to its own
 (docs/experiments_sampling.md, "Where one live token meets the next")."""
@@ -207,6 +211,18 @@ def joined(decoded: Scene, given: Scene, T_world_can: Tensor, keep: Tensor, left
     return blended.with_poses(keep, given.body_rot, given.T_world_root)
 
 
+def places_and_steps(T_world_can: Tensor) -> tuple[Tensor, Tensor]:
+    """Yaw and ground of each frame, in radians and metres, and their changes, turns the short way round, in float64.
+
+    (B, T, P, 4, 4) -> (B, T, P, 3), (B, T - 1, P, 3)
+    """
+    yaw, ground = to_planar(T_world_can.double())
+    places = torch.cat([yaw[..., None], ground], dim=-1)
+    steps = places.diff(dim=1)
+    steps[..., 0] = torch.atan2(steps[..., 0].sin(), steps[..., 0].cos())
+    return places, steps
+
+
 def gone_on(before: Tensor, path: Tensor, blend: int = GOES_ON) -> Tensor:
     """A path that goes on as the one before it went; its own speed takes over within `blend` frames.
 
@@ -221,16 +237,29 @@ def gone_on(before: Tensor, path: Tensor, blend: int = GOES_ON) -> Tensor:
     Returns:
         (B, T, P, 4, 4).
     """
-    yaw, ground = to_planar(torch.cat([before, path], dim=1).double())
-    turns = yaw.diff(dim=1)
-    steps = torch.cat([torch.atan2(turns.sin(), turns.cos())[..., None], ground.diff(dim=1)], dim=-1)
+    places, steps = places_and_steps(torch.cat([before, path], dim=1))
     known = before.shape[1] - 1
     gain = (steps[:, known - 1] - steps[:, 0]) / (known - 1)  # (B, P, 3) a frame
     since = torch.arange(1, path.shape[1] + 1, device=path.device, dtype=steps.dtype)[:, None, None]
     onward = steps[:, known - 1, None] + GAINS * (1 - torch.exp(-since / GAINS)) * gain[:, None]
     share = (1 - since / blend).clamp(0, 1) ** 2
     off = (share * (onward - steps[:, known:])).cumsum(dim=1)
-    return from_planar(yaw[:, known + 1 :] + off[..., 0], ground[:, known + 1 :] + off[..., 1:]).to(path)
+    there = places[:, known + 1 :] + off
+    return from_planar(there[..., 0], there[..., 1:]).to(path)
+
+
+def taken_up(before: Tensor, path: Tensor, blend: int = TAKES_UP) -> Tensor:
+    """A path that begins as fast as the one before it ended, and comes back to where it leads within `blend` frames.
+
+    Arguments as for `gone_on`. -> (B, T, P, 4, 4)
+    """
+    places, steps = places_and_steps(torch.cat([before, path], dim=1))
+    known = before.shape[1] - 1
+    since = torch.arange(1, path.shape[1] + 1, device=path.device, dtype=steps.dtype)[:, None, None]
+    left = (1 - since / min(blend, path.shape[1])).clamp_min(0)
+    off = since * left**2 * (steps[:, known - 1] - steps[:, known])[:, None]
+    there = places[:, known + 1 :] + off
+    return from_planar(there[..., 0], there[..., 1:]).to(path)
 
 
 def eased_in(T_world_before: Tensor, T_prev_can: Tensor, who: Tensor) -> Tensor:

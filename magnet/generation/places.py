@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from magnet.denoiser.core import DenoiserCore
-from magnet.generation.blending import GOES_ON, delta_between, eased_in, gone_on, warp_to_keyframe
+from magnet.generation.blending import GOES_ON, delta_between, eased_in, gone_on, taken_up, warp_to_keyframe
 from magnet.generation.conditioning import first_of, lookahead_limit, spans
 from magnet.generation.entering import starts
 from magnet.motion.frames import canonical_deltas, canonical_frame, from_9d, inverse, project_se2, to_9d
@@ -32,6 +32,7 @@ class Places:
         known, placed: (n, P) bool, whose tokens are given, and who stands somewhere.
         T_world_can: (B, 4 n, P, 4, 4) canonical frames of those who do.
         since: token steps to the first row from each one's last given one before it.
+        faint: (n, P) int, levels at which the stage that is sampled shows what is finished; None: all clean.
         rooted: whether something was known in rows that have been let go.
         finalized: rows of a causal plan whose bodies are final, and given from then on.
         released: rows that have been let go.
@@ -48,6 +49,7 @@ class Places:
         # Recorded across the border of two known tokens; the rest is filled in as it is placed.
         self.T_world_can = canonical_frame(self.given.T_world_root).clone()
         self.since: Tensor | None = None
+        self.faint: Tensor | None = None
         self.causal, self._lookahead_limit = schedule.causal, lookahead_limit(schedule)
         self.rooted, self.finalized, self.released = False, 0, 0
 
@@ -123,12 +125,20 @@ class Places:
         self.T_world_can[:, frames] = torch.where(new[:, None, None], placed, self.T_world_can[:, frames])
 
     def _gone_on(self, placed: Tensor, first: int) -> Tensor:
-        """Paths from row `first` on, of which those that follow known rows go on as fast. (B, T, P, 4, 4) -> same"""
-        if not first or not self.options.smooth_path or not bool(self.known[first - 1].any()):
+        """Paths from row `first` on that begin as fast as they went before. (B, T, P, 4, 4) -> same
+
+        What is known was right, and people go on from it; of what was made and shown noisily, networks know the speed
+        only roughly.
+        """
+        if not first or not self.options.smooth_path:
             return placed
         before = self.T_world_can[:, (first - 1) * TOKEN_FRAMES : first * TOKEN_FRAMES]
-        goes_on = self.known[first - 1].to(placed.device)[:, None, None]
-        return torch.where(goes_on, gone_on(before, placed), placed)
+        known, made = self.known[first - 1], (self.placed & ~self.known)[first - 1]
+        faintly = torch.zeros_like(made) if self.faint is None or self.causal else made & (self.faint[first - 1] > 0)
+        for who, way in ((known, gone_on), (faintly, taken_up)):
+            if bool(who.any()):
+                placed = torch.where(who.to(placed.device)[:, None, None], way(before, placed), placed)
+        return placed
 
     def starts(self, T_prev_can: Tensor, T_self_partner: Tensor | None, first: int, new: Tensor) -> Tensor:
         """Canonical frames just before token `first`; see `magnet.generation.entering.starts`."""

@@ -263,9 +263,11 @@ class Rollout:
         self._ask_for(stage)
         with torch.autocast(self._autocast[0], enabled=False):  # half precision is for the network, not for geometry
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
+            held = dataclasses.replace(stage, start=stage.start - self.first)
+            world.faint = faint_levels(self.options.guidance, world.known, held, world.since, world.causal)
             self.tokens = run_stages(
                 self._guided_by_condition,
-                [dataclasses.replace(stage, start=stage.start - self.first)],
+                [held],
                 self.tokens,
                 self.mask_noise,
                 world.given.present,
@@ -277,9 +279,7 @@ class Rollout:
                 self.first,
                 self.history,
                 self.body_guidance,
-                functools.partial(
-                    faint_levels, self.options.guidance, world.known, since=world.since, live=world.causal
-                ),
+                lambda stage: world.faint,
             )
         self.reached = max(self.reached, stage.active[1])
         if world.causal and self.expected.most:

@@ -72,8 +72,9 @@ class SamplerOptions:
             is best sampled, or `off`, as in streams and for a live partner (docs/corrections.md).
         smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
-            the one after the last is as it is expected. And people go on from what is given as fast as they went, in
-            live tasks from each token to the next. None: as the model is best sampled, or not.
+            the one after the last is as it is expected. And people go on as fast as they went from what is given, and
+            from stride to stride where what was made is shown noisily; in live tasks from each token to the next. None:
+            as the model is best sampled, or not.
         together: metres over the ground that couples stay within where scenes go on for long (ours,
             `magnet.generation.couples`): from three quarters of it on ways apart are shortened and people come slowly
             back, in what is made more than 40 token steps after what was given; not in live tasks and crowds. 0: nobody

@@ -13,6 +13,7 @@ from magnet.generation.blending import (
     smoothed_path,
     spring_from_given,
     spring_weights,
+    taken_up,
 )
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
@@ -145,7 +146,22 @@ def test_people_who_gain_speed_go_on_gaining_for_a_moment():
 
 def test_a_path_that_goes_on_evenly_stays():
     walk = path(*(0.04 * k for k in range(12)))
-    assert torch.allclose(gone_on(walk[:, :4], walk[:, 4:], 20), walk[:, 4:], atol=1e-6)
+    for way in (gone_on, taken_up):
+        assert torch.allclose(way(walk[:, :4], walk[:, 4:], 20), walk[:, 4:], atol=1e-6)
+
+
+def test_people_take_up_the_speed_they_had_and_come_back_to_the_path_that_was_made():
+    """Made: standing, after 5 cm and 0.03 rad a frame; within ten frames, or all there are, they are back there."""
+    time = torch.arange(4.0)
+    before = from_planar(3.09 + 0.03 * time, 0.05 * time[:, None] * torch.tensor([0.6, 0.8]))[None, :, None]
+    for frames in (30, 4):
+        path = before[:, -1:].expand(1, frames, 1, 4, 4)
+        made, blend = taken_up(before, path, 10), min(frames, 10)
+        yaw, ground = to_planar(torch.cat([before[:, -1:], made], dim=1)[0, :, 0])
+        first = (1 - 1 / blend) ** 2
+        assert float((ground[1] - ground[0]).norm()) == pytest.approx(0.05 * first, abs=1e-6)
+        assert float((yaw[1] - yaw[0]).sin()) == pytest.approx(0.03 * first, abs=1e-5)
+        assert torch.allclose(made[:, blend - 1 :], path[:, blend - 1 :], atol=1e-6)
 
 
 def test_without_blending_only_given_frames_are_put_back(pair):

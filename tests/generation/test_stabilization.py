@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from magnet.generation import places
 from magnet.generation.rollout import generate, stream
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -46,6 +47,29 @@ def test_for_a_while_after_what_was_given_all_is_shown_clean(model) -> None:
     same = (clean.T_world_root == late.T_world_root).flatten(3).all(dim=-1)[0].all(dim=-1)
     assert bool(same[:32].all()) and not bool(same[60:].any())
     assert torch.equal(clean.T_world_root, never.T_world_root)
+
+
+@pytest.mark.parametrize("level", [0, 300])
+@pytest.mark.parametrize("name", ["joint_future", "partner_inpainting", "motion_control"])
+def test_after_what_was_shown_faintly_people_take_up_the_speed_they_had(model, name, level, monkeypatch) -> None:
+    """Of those who are made, from the second stride on, where the past was shown noisily; live tokens do otherwise."""
+    start, task = random_scene(1, 64, 2, torch.Generator().manual_seed(4)), registry.get(name)()
+    guidance = Guidance(stabilization_level=level, stabilization_beside=level)
+    options = SamplerOptions(3, 4, pyramid_offset=0, guidance=guidance, settle="off", smooth_path=True)
+
+    def made() -> torch.Tensor:
+        return generate(model, start, task, 8, 48, 1, options, torch.Generator().manual_seed(0)).T_world_root
+
+    plain = made()
+    sideways = torch.eye(4)
+    sideways[0, 3] = 5.0
+    monkeypatch.setattr(places, "taken_up", lambda before, path: sideways @ path)
+    moved = (made() - plain)[0, ..., 0, 3] > 2
+    if not level or name == "motion_control":
+        assert not bool(moved.any())
+    else:
+        assert not bool(moved[:30].any()) and bool(moved[33:, 0].all())
+        assert bool(moved[33:, 1].all()) == (name == "joint_future")
 
 
 @pytest.mark.parametrize("name", registry.names())
