@@ -19,7 +19,7 @@ from magnet.metrics.futures import Futures
 from magnet.metrics.hand_contact import HandContact
 from magnet.metrics.interaction import MotionInteraction, pearson
 from magnet.metrics.interval import bootstrap_interval, independent_units
-from magnet.metrics.jitter import Jitter, jitter
+from magnet.metrics.jitter import Jitter, Jolts, jitter
 from magnet.metrics.memorisation import NearestTraining
 from magnet.metrics.partners import PartnerBearing, PartnerDistance, TurnRate, bearing, partner_distance, turn_rate
 from magnet.metrics.penetration import Interpenetration
@@ -46,6 +46,7 @@ __all__ = [
     "HandContact",
     "Interpenetration",
     "Jitter",
+    "Jolts",
     "MotionInteraction",
     "MotionMetric",
     "NearestTraining",
@@ -139,5 +140,6 @@ def _of_motion(fps: float, of: Of, scored: Tensor | None, confidence: float | No
         "ground": GroundPenetration(**means),
         "toes": StandingToes(**means),
         "jitter": Jitter(**means),
+        "jolts": Jolts(**means),
         "borders": TokenBorders(of=of, agents=scored),
     }

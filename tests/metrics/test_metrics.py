@@ -13,6 +13,7 @@ from magnet.metrics import (
     FootSkating,
     FrechetDistance,
     Jitter,
+    Jolts,
     MotionInteraction,
     PartnerDistance,
     PositionError,
@@ -204,6 +205,19 @@ def test_jitter_equals_a_plain_loop(choose: Choose) -> None:
                      for j in range(1, 22)]  # fmt: skip
             lengths += [math.hypot(*difference) * 30**3 / 10 for difference in third]
     assert result(Jitter(), *batch, agents=choose(batch))["jitter"] == pytest.approx(np.mean(lengths), rel=1e-10)
+
+
+@WHO
+def test_jolts_equal_a_plain_loop(choose: Choose) -> None:
+    batch = draw_batch()
+    x, counts, lengths = batch[0].double().numpy(), scored(batch, choose), []
+    for s, b, t, p in itertools.product(range(4), range(3), range(18), range(3)):
+        if any(counts[b][t + i][p] for i in range(3)):
+            second = x[s, b, t + 2, p, 0] - 2 * x[s, b, t + 1, p, 0] + x[s, b, t, p, 0]
+            lengths.append(math.hypot(*second) * 30**2)
+    above = float(np.quantile(lengths, 0.7))
+    jolts = result(Jolts(above=above), *batch, agents=choose(batch))["jolts"]
+    assert jolts == pytest.approx(np.mean(np.array(lengths) > above), rel=1e-10)
 
 
 def test_jitter_is_the_third_derivative() -> None:
