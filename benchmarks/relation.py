@@ -88,6 +88,7 @@ def bars() -> list[Bar]:
         listed.append(Bar(run, "frames over 10 cm deep", of("depth_over_10cm"), fixed(deepest)))
         listed.append(Bar(run, "frames in which somebody floats", of("floating"), fixed(0.0)))
         listed.append(Bar(run, "frames in which somebody is down", of("down"), fixed(DOWN)))
+        listed.append(Bar(run, "frames in which somebody is thrown", of("jolts"), fixed(0.0)))
     return listed
 
 

@@ -12,7 +12,6 @@ from magnet.motion.planar import rotate_ground
 from magnet.motion.resample import smoothstep
 from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import TOKEN_FRAMES
 
 SPRING = 5.0
 """Rate of `spring_from_given`, divided by the frames `blend` of a seam. Lower is smoother, but feet that the decoder
@@ -32,10 +31,6 @@ noisily (docs/experiments_sampling.md, "Where one stride meets the next")."""
 EASES_IN = 4
 """Frames in which a token made live comes from the speed of the one before to its own
 (docs/experiments_sampling.md, "Where one live token meets the next")."""
-
-AT_BORDERS = (1.0, 10.0, 18.0, 10.0, 1.0)
-"""Weights of a frame beside a token border and of its neighbours: two fifths 1 : 4 : 6 : 4 : 1, else 1 : 2 : 1
-(docs/experiments_sampling.md, "Token borders beside somebody who is given")."""
 
 QUICK = 0.06
 """Largest change of a difference in a frame, radians or metres, that is taken for a speed to go on with."""
@@ -298,7 +293,7 @@ def freeze_after(scene: Scene, there: Tensor, before: Scene | None = None) -> Sc
     return scene.replace(body_rot=scene.body_rot[:, last, agents], T_world_root=scene.T_world_root[:, last, agents])
 
 
-def smoothed_path(T_world_can: Tensor, placed: Tensor, fixed: Tensor, beside: Tensor | None = None) -> Tensor:
+def smoothed_path(T_world_can: Tensor, placed: Tensor, fixed: Tensor) -> Tensor:
     """Canonical frames whose places are averaged with those of the frames before and after, 1 : 2 : 1.
 
     Networks that tell only what noise hides tremble by about a millimetre a frame in where people stand, which makes
@@ -306,21 +301,13 @@ def smoothed_path(T_world_can: Tensor, placed: Tensor, fixed: Tensor, beside: Te
     and the last frame stay.
 
     Args:
-        T_world_can: (B, T, P, 4, 4), from the first frame of a token on.
+        T_world_can: (B, T, P, 4, 4).
         placed: (T, P) bool, who has a place in which frame.
         fixed: (T, P) bool, who must not be moved.
-        beside: (T, P) bool, who is made beside somebody who is given, by whom it is placed token by token: frames on
-            both sides of a token border are averaged over five (`AT_BORDERS`). None: nobody.
     """
     place = T_world_can[..., :3, 3]
     mean = (place[:, :-2] + 2 * place[:, 1:-1] + place[:, 2:]) / 4
     free = (placed[:-2] & placed[1:-1] & placed[2:] & ~fixed[1:-1])[..., None]
     smooth = T_world_can.clone()
     smooth[:, 1:-1, :, :3, 3] = torch.where(free, mean, place[:, 1:-1])
-    if beside is not None and bool(beside.any()):
-        frame = torch.arange(2, place.shape[1] - 2, device=place.device)
-        border = ((frame + 1) % TOKEN_FRAMES < 2)[:, None] & beside[frame] & ~fixed[frame]
-        free = (border & placed.unfold(0, 5, 1).all(dim=-1))[..., None]
-        mean = place.unfold(1, 5, 1) @ place.new_tensor(AT_BORDERS) / sum(AT_BORDERS)
-        smooth[:, frame, :, :3, 3] = torch.where(free, mean, smooth[:, frame, :, :3, 3])
     return smooth

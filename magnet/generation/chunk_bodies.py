@@ -48,10 +48,9 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
 
 def shown_path(world: World, first: int, stop: int) -> Tensor:
     """Canonical frames of token steps [first, stop) as they are shown. -> (B, 4 n, P, 4, 4)"""
-    until = stop * TOKEN_FRAMES + 2
+    until = stop * TOKEN_FRAMES + 1
     T_world_can, frames = world.T_world_can[:, :until], slice(first * TOKEN_FRAMES, stop * TOKEN_FRAMES)
     if world.options.smooth_path:
-        beside = world.known.any(dim=1, keepdim=True) & ~world.known
-        who = (world.rows_by_frame(each)[:until] for each in (world.placed, world.known, beside))
-        T_world_can = smoothed_path(T_world_can, *who)
+        placed, known = (world.rows_by_frame(each)[:until] for each in (world.placed, world.known))
+        T_world_can = smoothed_path(T_world_can, placed, known)
     return T_world_can[:, frames]

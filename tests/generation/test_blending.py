@@ -208,16 +208,3 @@ def test_whoever_is_given_or_beside_a_gap_stays_where_they_are():
     tremble = path(0, 1, 0, 1, 0, 1)
     moved = (smoothed_path(tremble, placed, given) != tremble).flatten(3).any(-1)[0]
     assert moved.nonzero().tolist() == [[1, 1]]
-
-
-def test_a_jump_at_a_token_border_is_spread_over_five_frames_beside_somebody_who_is_given():
-    placed, fixed = torch.ones(12, 2, dtype=torch.bool), torch.tensor([False, True]).expand(12, 2)
-    jump = path(0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1)
-    beside = ~fixed
-    alone, made = (smoothed_path(jump, placed, fixed, each)[0, :, 0, 0, 3] for each in (None, beside))
-    expected = alone.clone()
-    expected[3:5] = torch.tensor([11.0, 29.0]) / 40
-    assert torch.allclose(made, expected)
-    assert torch.equal(smoothed_path(jump, placed, fixed, beside)[:, :, 1], jump[:, :, 1]), "who is given stays"
-    walk = path(*range(12))
-    assert torch.allclose(smoothed_path(walk, placed, ~beside, beside)[:, :, 0], walk[:, :, 0], atol=1e-5)
