@@ -39,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
     add = options.add_argument
     add("--name", required=True, help="which agent this process is")
     add("--scene", metavar="START", help="scene of all agents to start from")
+    add("--body", metavar="FILE", help="SMPL-X npz the shapes of all files belong to (default: the open body)")
     add("--names", metavar="A,B", help="all agents, in the order of the scene's slots (default: A, B, C ...)")
     add("--listen", metavar="ADDRESS", help="where the others receive from it, such as tcp://127.0.0.1:5601")
     add("--connect", action="append", default=[], metavar="NAME=ADDRESS", help="where another sends from; repeated")
@@ -98,7 +99,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     for out in filter(None, (given.out, given.report)):  # written when it is over
         require_place(out)
     torch.set_num_threads(given.threads)
-    start = read(given.scene).plain()
+    start = read(given.scene, body=given.body).plain()
     names = tuple(map(str.strip, given.names.split(",") if given.names else string.ascii_uppercase[: start.agents]))
     connect = peers(given.connect, names, given.name, given.listen)
     if not connect and given.play is None and (others := [name for name in names if name != given.name]):
@@ -151,7 +152,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
     from magnet.tasks.agentic import AgenticAsync, AgenticSync
 
     if given.play is not None:
-        recording = read(given.play).plain()
+        recording = read(given.play, body=given.body).plain()
         if not 0 <= given.person < recording.agents:
             raise CommandError(f"--person {given.person}: {given.play} has people 0 to {recording.agents - 1}")
         return Player(recording.permute_agents(torch.tensor([given.person])), start, names, given.name)
@@ -159,7 +160,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
     options = SamplerOptions(steps=given.steps, **asked)
     task = AgenticSync() if given.task == "agentic_sync" else AgenticAsync()
     model = DenoiserCore.load(given.model)
-    if said := other_body(model, start.body, "fixed"):
+    if said := other_body(model, start.body):
         print(f"magnet: {said}", file=sys.stderr)
     return Agent(model, start, names, given.name, task, options, given.seed)
 
@@ -199,4 +200,5 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
 
         write_text(given.report, json.dumps(report, indent=1) + "\n")
     if given.out is not None and told:
-        print(f"written: {cat_time([motion_of(each.poses, each.betas) for each in told]).save(given.out)}")
+        made = cat_time([motion_of(each.poses, each.betas) for each in told])
+        print(f"written: {made.replace(body=member.start.body).save(given.out)}")

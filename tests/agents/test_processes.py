@@ -23,6 +23,7 @@ from magnet.agents.zeromq import Link, engine, make_keys
 from magnet.cli import agent
 from magnet.cli.agent import peers
 from magnet.cli.errors import CommandError
+from magnet.datamodules.fakes.body import write_body
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
@@ -358,3 +359,17 @@ def test_an_agent_whose_model_learned_from_another_body_says_so(
     assert agent.main(["--name", "A", "--scene", str(folder / "two.npz"), "--listen", addresses_of("A")["A"]]) == 0
     said = "magnet: the model was trained with body 'smplx-neutral', but these people have 'open-1', "
     assert (said in capsys.readouterr().err) == (trained != "open-1")
+
+
+def test_people_of_another_body_take_part_once_its_file_is_said_and_are_written_as_theirs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("magnet.cli.agent.signal.signal", lambda *_: None)
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(5)).replace(body="made-up-smplx")
+    start, made = str(scene.save(tmp_path / "start.npz")), tmp_path / "made.npz"
+    words = ["--name", "A", "--scene", start, "--play", start, "--meet", "0", "--pace", "others", "--out", str(made)]
+    words += ["--listen", addresses_of("A")["A"]]
+    with pytest.raises(ValueError, match=r"'made-up-smplx'.* give its file: --body FILE"):
+        agent.main(words)
+    assert agent.main([*words, "--body", str(write_body(tmp_path / "body.npz"))]) == 0
+    assert Scene.load(made).body == "made-up-smplx"
