@@ -211,7 +211,12 @@ class ViewerBase:
         self.distance = distance
 
     def move_cameras(self, preset: str, client: Any = None) -> None:
-        """Send cameras (of everybody, or of one) to a preset, and back until all people are in the picture."""
+        """Send cameras (of everybody, or of one) to a preset, and back until all people are in the picture.
+
+        Other presets, which viser passes on from clients as they come, change nothing.
+        """
+        if preset not in CAMERAS:
+            return
         for each in [client] if client is not None else self.server.get_clients().values():
             with each.atomic():
                 each.camera.position = self._eye(preset, self.distance)

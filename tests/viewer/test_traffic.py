@@ -125,6 +125,8 @@ def test_a_camera_sent_to_a_preset_sees_everybody_while_nothing_plays(
         monkeypatch.setattr(viewer.server, "get_clients", lambda: {7: client})
         viewer.placed.add(7)
         viewer.distance = 0.5  # far too near
+        viewer.move_cameras("below", client)  # there is no such preset
+        assert camera.position == [0.0, 1.0, 1.0]
         viewer.move_cameras("front", client)
         before = np.array(camera.position)
         viewer.shown = -1
