@@ -36,6 +36,8 @@ MOST_WEIGHT, MOST_BLEND = 1e6, 1_000_000
 """Of a pairwise transform and frames of a blend: beyond, numbers overflow."""
 MOST_SPACING = 1000.0
 """Metres between the couples of a crowd: much farther from the middle float32 moves people in steps of millimetres."""
+LEAST_TOGETHER = 0.3
+"""Metres between two pelvises within which no couple can be held: bodies are as wide."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,8 @@ class SamplerOptions:
             as the model is best sampled, or not.
         together: metres over the ground that couples stay within where scenes go on for long (ours,
             `magnet.generation.couples`): from three quarters of it on ways apart are shortened and people come slowly
-            back, in what is made more than 40 token steps after what was given; not in live tasks and crowds. 0: nobody
-            is led. None: as the model is best sampled, or 0.
+            back, in what is made more than 40 token steps after what was given; not in live tasks and crowds. At least
+            0.3, or 0: nobody is led. None: as the model is best sampled, or 0.
         settle_blocks: correct each finished block too, so that the model goes on from there, which shakes more.
         requantize: move generated latents to the nearest code before they are decoded and continued, as the reference
             does. None: if the model was trained to generate codes (`target` of the denoiser).
@@ -167,6 +169,10 @@ class SamplerOptions:
         require_number("eta", self.eta, 0, 1)
         if self.together is not None:
             require_number("together", self.together, least=0)
+            if 0 < self.together < LEAST_TOGETHER:
+                raise ValueError(
+                    f"together: got {self.together:g}, expected metres of at least {LEAST_TOGETHER:g}, or 0 for none"
+                )
         if self.noise_scale is not None:
             require_number("noise_scale", self.noise_scale, over=0, most=2)
             if self.noise_scale != 1 and not self.eta:

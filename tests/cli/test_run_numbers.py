@@ -81,7 +81,11 @@ def test_devices_that_can_be_are_taken_and_others_are_not() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
-    [("pyramid_offset", 9999, "got 9999, expected 0 to 1000"), ("crowd_spacing", 1e30, "over 0 and at most 1000")],
+    [
+        ("pyramid_offset", 9999, "got 9999, expected 0 to 1000"),
+        ("crowd_spacing", 1e30, "over 0 and at most 1000"),
+        ("together", 1e-60, "got 1e-60, expected metres of at least 0.3, or 0"),
+    ],
 )
 def test_options_of_sampling_are_bounded(field: str, value: float, message: str) -> None:
     with pytest.raises(ValueError, match=f"{field}: .*{message}"):
