@@ -217,8 +217,12 @@ class ProgressLines(ProgressBar):
         begun, first = self.begun[what]
         if done > first and total != float("inf"):
             left = f", {clock((now - begun) * (total - done) / (done - first))} left"
+        self.say(f"{what} {done}/{total:g}{left}{more}")
+
+    def say(self, line: str) -> None:
+        """Print a line."""
         try:
-            print(f"{what} {done}/{total:g}{left}{more}", flush=True)
+            print(line, flush=True)
         except BrokenPipeError:
             if not output_closed():
                 raise
@@ -244,13 +248,14 @@ class ProgressLines(ProgressBar):
 class SamplingProgress(ProgressBar):
     """Progress of `test` and `predict` in denoising steps, and of what `test` measures then, beside baselines.
 
-    One batch of scenes can take minutes with either.
+    One batch of scenes can take minutes with either. What baselines learn from is read first, which takes seconds.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.enabled = True
         self.bar: Progress | None = None
+        self.reads: TaskID | None = None
         self.measures: TaskID | None = None
         self.lines = ProgressLines()
 
@@ -264,15 +269,20 @@ class SamplingProgress(ProgressBar):
         self.measured, self.measures = 0, None
         model.progress, model.measuring = self._advance, self._measured
         self.lines._start()
+        reads = f"{what}: reading training windows" if what == "test" and model.baselines else ""
         if self.enabled and trainer.is_global_zero and sys.stdout.isatty():
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
             self.bar = Progress(*columns)
             self.bar.start()
+            self.reads = self.bar.add_task(reads, total=None) if reads else None
             self.task = self.bar.add_task(f"{what}: denoising steps", total=self.total)
+        elif self.enabled and reads:
+            self.lines.say(reads)
 
     def _advance(self, steps: int) -> None:
         self.done += steps
         if self.bar is not None:
+            self._have_read(self.bar)
             self.bar.advance(self.task, steps)
         elif self.enabled:
             self.lines.tell(f"{self.what}: denoising step", self.done, self.total)
@@ -282,11 +292,17 @@ class SamplingProgress(ProgressBar):
         self.measured += 1
         what, total = f"{self.what}: measuring", self.batches * each
         if self.bar is not None:
+            self._have_read(self.bar)
             if self.measures is None:
                 self.measures = self.bar.add_task(what, total=total)
             self.bar.advance(self.measures)
         elif self.enabled:
             self.lines.tell(what, self.measured, total)
+
+    def _have_read(self, bar: Progress) -> None:
+        if self.reads is not None:
+            bar.update(self.reads, total=1, completed=1)
+            self.reads = None
 
     def _end(self, *_: Any, **__: Any) -> None:
         if self.bar is not None:

@@ -71,6 +71,23 @@ def test_what_is_measured_after_sampling_is_counted_too(
         assert [f"{done}/9" for done in range(1, 10)] == re.findall(r"test: measuring (\d+/\d+)", said)
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("baselines", [True, False])
+def test_what_baselines_learn_from_is_said_to_be_read_before_the_first_step(
+    baselines: bool, terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    progress = run_folder.progress_bar(sampling=True)
+    progress.lines.seconds = 0.0
+    evaluator, trainer = prepared(baselines=baselines, samples=1)
+    trainer.callbacks.append(progress)
+    trainer.test(evaluator, datamodule=data(limit=1), verbose=False)
+    said = capsys.readouterr().out
+    before = said[: said.index("test: denoising step")]
+    assert ("test: reading training windows" in before) == baselines
+    assert bool(re.search(r"test: reading training windows .*1/1", said)) == (baselines and terminal)
+
+
 def test_a_run_that_begins_in_the_same_second_gets_a_folder_of_its_own(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "quick" / "2026-01-01_00-00-00"
     with run_folder.claimed(folder) as one, run_folder.claimed(folder) as other:
