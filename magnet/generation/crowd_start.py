@@ -105,7 +105,7 @@ def start_from_nothing(
     made = start_crowd(model, count, options, generator, (), spacing, betas)
     slots = torch.where(there, there.cumsum(0) - 1, count + (~there).cumsum(0) - 1)
     made = made.pad_agents(scene.agents).permute_agents(slots).to(scene.device)
-    return made.replace(body=scene.body, betas=scene.betas)
+    return made.replace(body=scene.body, betas=scene.betas, names=scene.names)
 
 
 def compose(groups: Sequence[Scene], people: int, generator: torch.Generator, spacing: float = SPACING) -> Scene:

@@ -19,7 +19,7 @@ from magnet.generation.crowd_start import compose, start_crowd
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import inverse, pairwise, partners, to_9d
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
@@ -286,6 +286,13 @@ def test_each_sample_of_a_crowd_from_nothing_begins_anew_and_nothing_was_given(m
     assert (made.scenes, made.frames, made.agents, made.context) == (2, 12, 5, 0)
     assert not torch.equal(made.T_world_root[0, 0], made.T_world_root[1, 0])
     assert len(made.betas[0].unique(dim=0)) == 5 and torch.equal(made.betas[0], made.betas[1])
+
+
+@pytest.mark.parametrize("people", [2, 5])
+def test_scenes_from_nothing_keep_their_names(model: Denoiser, people: int) -> None:
+    scene = concatenate([crowd(people, 4).replace(names=(name,)) for name in ("market", "square")])
+    made = generate_crowd(model, scene, registry.get("generation")(), 0, 4, 2, QUICK, seeded())
+    assert made.names == ("market", "market", "square", "square")
 
 
 @pytest.mark.slow
