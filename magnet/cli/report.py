@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magnet.cli.flags import PlainParser
+
+if TYPE_CHECKING:
+    from magnet.report.cells import Cell
+    from magnet.report.run import Runner
 
 EPILOG = """\
 TABLE is 2, 3, 4, 5, A.3, A.4, A.5, A.6, Fig.7, own (choices of ours), leak (what partner tasks gain by the reference's
@@ -48,7 +52,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="TEXT",
         help="run only cells whose name holds one of these, and what these need",
     )
-    skip = "leave cells for later whose name holds one of these"
+    skip = "leave cells for later whose name holds one of these, and what needs a training of them that is not done"
     add("--skip", nargs="+", action="extend", default=[], metavar="TEXT", help=skip)
     add("--page_only", action="store_true", help="write the page from what is done")
     return options
@@ -82,8 +86,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         told(provenance()["git"]),
         own_data,
     )
-    wanted = [cell for cell in cells if held(cell.name, given.only or [""]) and not held(cell.name, given.skip)]
-    wanted = [cell for cell in cells if cell in wanted or cell in {each.needs for each in wanted}]
+    wanted = chosen(runner, cells, given.only or [""], given.skip)
     todo = runner.missing(wanted)
     if given.dry_run:
         for cell in todo:
@@ -104,6 +107,15 @@ def main(arguments: Sequence[str] = ()) -> int:
 def told(git: Mapping[str, Any] | None) -> str:
     """A state of the source tree: its short commit, and a plus where files were changed; empty where none is known."""
     return "" if git is None else git["commit"][:7] + "+" * git["changed"]
+
+
+def chosen(runner: Runner, cells: Sequence[Cell], only: Sequence[str], skip: Sequence[str]) -> list[Cell]:
+    """The cells that --only and --skip leave, and the trainings that they need."""
+    later = {cell for cell in cells if held(cell.name, skip)}
+    wait = {cell for cell in cells if cell.needs in later and cell.needs in runner.missing([cell.needs, cell])}
+    wanted = {cell for cell in cells if held(cell.name, only)} - later - wait
+    needed = {cell.needs for cell in wanted}
+    return [cell for cell in cells if cell in wanted or cell in needed]
 
 
 def held(name: str, texts: Sequence[str]) -> bool:

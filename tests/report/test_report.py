@@ -15,6 +15,7 @@ import torch
 import yaml
 
 from magnet import cli
+from magnet.cli.report import chosen
 from magnet.cli.train import run_trainer
 from magnet.denoiser.module import Denoiser
 from magnet.report import measure, run
@@ -160,6 +161,21 @@ def test_a_dry_run_lists_cells_and_runs_none(
     assert not Path(out).exists()
     assert cli.main(["report", "9"]) == 2
     assert "table: got '9', expected one of 2, 3, 4" in capsys.readouterr().err
+
+
+def test_a_training_that_is_skipped_is_not_run_for_what_needs_it_which_waits_unless_it_is_done(tmp_path: Path) -> None:
+    cells = cells_of(TABLES["5"](PLAN))
+    done, *others = [cell for cell in cells if cell.kind == "train"]
+    store = Store(tmp_path)
+    runner = Runner(store, lambda _: 1, PLAN.configs, "duet", say=lambda _: None)
+    last = Path("trainings", done.name, "checkpoints", "last.ckpt")
+    (tmp_path / last).parent.mkdir(parents=True)
+    (tmp_path / last).write_text("some weights")
+    store.put(done, {"rows": {}, "checkpoint": str(last)})
+    todo = runner.missing(chosen(runner, cells, [""], ["train-"]))
+    assert others and todo == [cell for cell in cells if cell.kind != "train" and cell.needs not in others]
+    assert done in {cell.needs for cell in todo}
+    assert runner.missing(chosen(runner, cells, ["measure-"], [])) == [cell for cell in cells if cell != done]
 
 
 @pytest.mark.slow
