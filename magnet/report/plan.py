@@ -136,9 +136,14 @@ def digest_of_config(path: Path) -> str:
     if not path.is_file():
         return ""
     text = path.read_text(encoding="utf-8")
-    below = (yaml.safe_load(text) or {}).get("extends", [])
-    parts = [text, *(digest_of_config(path.parent / name) for name in ([below] if isinstance(below, str) else below))]
+    parts = [text, *map(digest_of_config, extended(path, yaml.safe_load(text) or {}))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def extended(path: Path, said: dict[str, Any]) -> list[Path]:
+    """The files that a configuration extends, by what it says."""
+    below = said.get("extends") or []
+    return [path.parent / name for name in ([below] if isinstance(below, str) else below)]
 
 
 @functools.cache

@@ -13,6 +13,7 @@ import yaml
 
 from magnet.report import measure
 from magnet.report.cells import Cell, Store
+from magnet.report.plan import extended
 from magnet.shared import sharing
 
 GUESSED = {"train": 600.0, "measure": 45.0, "speed": 60.0, "long": 60.0}
@@ -136,9 +137,22 @@ class Runner:
 
 def own_window(config: Path) -> list[str]:
     """Flags for the window that a training asks for itself, whatever other data it is given."""
-    data = (yaml.safe_load(config.read_text(encoding="utf-8")) or {}).get("data") or {}
-    frames = data.get("init_args", {}).get("window_frames")
+    frames = asked_window(config)[1]
     return [] if frames is None else ["--data.window_frames", str(frames)]
+
+
+def asked_window(config: Path) -> tuple[bool, int | None]:
+    """Whether a configuration names a model, with all that it extends, and the window that it asks for.
+
+    Files of data alone that it extends ask for none: other data take their place.
+    """
+    said = yaml.safe_load(config.read_text(encoding="utf-8")) or {}
+    below = [asked_window(file) for file in extended(config, said)]
+    data = said.get("data")
+    options = data.get("init_args") if isinstance(data, dict) else None  # a bare word names a class
+    own = options.get("window_frames") if isinstance(options, dict) else None
+    asked = [frames for model, frames in [*below, (True, own)] if model and frames is not None]
+    return "model" in said or any(model for model, _ in below), asked[-1] if asked else None
 
 
 def clock(seconds: float) -> str:

@@ -22,7 +22,7 @@ from magnet.report import measure, run
 from magnet.report.cells import Cell, Store, Weights
 from magnet.report.made import by_code, took
 from magnet.report.page import page
-from magnet.report.run import Runner
+from magnet.report.run import Runner, own_window
 from magnet.report.summary import missing, summary
 from magnet.report.tables import TABLES, cells_of
 from tests.report.toys import PLAN, run_of
@@ -221,6 +221,25 @@ def test_a_report_on_other_recordings_trains_on_them_by_windows_that_a_peer_need
     (run_config,) = Path("out/trainings").glob("*/config.yaml")
     trained = yaml.safe_load(run_config.read_text())["data"]
     assert trained["class_path"].endswith("DuoBox") and trained["init_args"]["window_frames"] == 184
+
+
+@pytest.mark.parametrize(
+    ("training", "below", "flags"),
+    [
+        ("data: Synthetic", "", []),
+        ("data: {class_path: Synthetic, init_args: }", "", []),
+        ("data: {init_args: {window_frames: 184}}", "", ["--data.window_frames", "184"]),
+        ("extends: below.yaml\ndata:", "model: Denoiser\ndata: {init_args: {window_frames: 184}}",
+         ["--data.window_frames", "184"]),
+        ("extends: below.yaml\nmodel: Denoiser", "data: {init_args: {window_frames: 64}}", []),
+    ],
+)  # fmt: skip
+def test_a_training_asks_for_its_window_by_what_it_extends_and_not_by_data_that_are_replaced(
+    training: str, below: str, flags: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "below.yaml").write_text(below, encoding="utf-8")
+    (tmp_path / "training.yaml").write_text(training, encoding="utf-8")
+    assert own_window(tmp_path / "training.yaml") == flags
 
 
 class Gone(BaseException):
