@@ -144,21 +144,28 @@ def client_in_the_docs(folder: Path) -> None:
     (folder / "client.py").write_text(block)
 
 
-def test_the_client_in_the_docs_begins_where_the_others_are_and_not_with_what_it_is_told_of_before(tmp_path):
+@pytest.mark.parametrize("come_to", [{"A": 9}, {"A": 9, "C": 999}, {"A": 9, "C": 999, "D": 9}])
+def test_the_client_in_the_docs_begins_where_two_others_are_or_the_only_one(come_to: dict[str, int], tmp_path) -> None:
+    """And not with what it is told of before, nor where one alone has run ahead."""
     client_in_the_docs(tmp_path)
-    addresses = addresses_of("AB")
-    link = Link("A", addresses["A"], {"B": addresses["B"]})
-    client = subprocess.Popen([sys.executable, "client.py", "B", addresses["B"], addresses["A"]], cwd=tmp_path)
-    poses, heard, end = np.zeros((4, POSE), np.float32), [], time.monotonic() + 60
-    while not any(message.kind == "frames" for message in heard) and time.monotonic() < end:
-        heard += [unpack(parts) for _, parts in link.receive(0.05)]
-        if len(heard) == 1:  # its first hello, answered with ten tokens
-            for index in range(10):
-                link.send(pack(Message("frames", "A", "A", 1, 4 * index, 0.0, poses=poses)))
+    addresses = addresses_of("".join(["B", *come_to]))
+    links = {name: Link(name, addresses[name], {"B": addresses["B"]}) for name in come_to}
+    words = [sys.executable, "client.py", "B", *(addresses[name] for name in ("B", *come_to))]
+    client = subprocess.Popen(words, cwd=tmp_path)
+    poses, begun, end = np.zeros((4, POSE), np.float32), None, time.monotonic() + 60
+    while begun is None and time.monotonic() < end:
+        for name, link in links.items():
+            for _, parts in link.receive(0.05):
+                message = unpack(parts)
+                begun = message.frame if begun is None and message.kind == "frames" else begun
+                link.send(pack(Message("hello", name, name, 1, -1, 0.0)))
+                for index in range(come_to[name] - 9, come_to[name] + 1) if set(message.heard) == set(come_to) else ():
+                    link.send(pack(Message("frames", name, name, 1, 4 * index, 0.0, poses=poses)))
     client.kill()
     client.wait()
-    link.close()
-    assert heard[-1].kind == "frames" and heard[-1].frame == 40
+    for link in links.values():
+        link.close()
+    assert begun == 40
 
 
 @pytest.mark.slow
