@@ -1,7 +1,11 @@
-"""`python -m tests.without_posix ARGUMENTS`: the command where what only POSIX has is not there, as on Windows."""
+"""`python -m tests.without_posix ARGUMENTS`: the command where what only POSIX has is not there, as on Windows.
+
+Several commands in one process have THEN between them, and the last one's exit code.
+"""
 
 import builtins
 import io
+import itertools
 import os
 import signal
 import sys
@@ -47,4 +51,5 @@ if __name__ == "__main__":
     from magnet.cli import main
 
     take_away()
-    sys.exit(main(sys.argv[1:]))
+    several = [list(words) for then, words in itertools.groupby(sys.argv[1:], "THEN".__eq__) if not then]
+    sys.exit([main(words) for words in several][-1])

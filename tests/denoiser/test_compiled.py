@@ -14,7 +14,11 @@ from magnet import packing
 from magnet.denoiser import lean
 from magnet.denoiser.compiled import Compiled
 from magnet.denoiser.lean import LeanTransformer, Precision
+from tests.cases import some_quick
 from tests.denoiser.test_lean import network, question
+
+QUICK = ("int8", "eager")
+"""Traced, and run without what else becomes of a trace, which takes five times as long."""
 
 
 def doubled(x: Tensor) -> Tensor:
@@ -55,9 +59,11 @@ def test_packed_weights_of_float32_are_not_compiled() -> None:
         assert torch.equal(packed(*asked, compiled=True), plain)
 
 
-@pytest.mark.parametrize("precision", ["float32", "int8"])
+@pytest.mark.parametrize(
+    ("precision", "backend"), some_quick([("float32", "aot_eager"), ("int8", "aot_eager"), QUICK], QUICK)
+)
 @torch.no_grad()
-def test_compiled_blocks_give_the_same(precision: Precision, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_blocks_give_the_same(precision: Precision, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced as on any machine: without a C++ compiler, and without what is packed for a processor."""
     for module in (packing, lean):
         monkeypatch.setattr(module, "packs", lambda: False)
@@ -66,7 +72,7 @@ def test_compiled_blocks_give_the_same(precision: Precision, monkeypatch: pytest
 
     def tracing(run: Any, **how: Any) -> Any:
         traced.append(run)
-        return compiled(run, backend="aot_eager", **how)
+        return compiled(run, backend=backend, **how)
 
     monkeypatch.setattr(torch, "compile", tracing)
     made = network(rope="heads")
