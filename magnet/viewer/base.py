@@ -276,7 +276,8 @@ class ViewerBase:
 
     def tracks(self) -> Tracks:
         """Content of the timeline: the people of all takes, in order."""
-        known = [np.resize(view.take.known, (self.clock.frames, len(view.take.slots))) for view in self.views]
+        frames = np.arange(self.clock.frames)  # of the longest take; the others stay as they were in their last one
+        known = [view.take.known[frames.clip(max=len(view.take.known) - 1)] for view in self.views]
         own = np.concatenate([view.own for view in self.views])
         return Tracks(np.concatenate(known, axis=1)[:, :TRACKS], own[:TRACKS])
 

@@ -64,6 +64,20 @@ def test_the_timeline_is_as_wide_as_the_picture_and_nothing_happens_while_nobody
     assert EDGE > 0
 
 
+def test_a_take_that_ends_before_the_others_is_not_given_again(body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    generator = torch.Generator().manual_seed(1)
+    takes = [take(f"{frames}", random_scene(1, frames, 1, generator), context=8) for frames in (24, 60)]
+    viewer = Viewer(takes, body, port=0)
+    try:
+        known = viewer.tracks().known
+    finally:
+        viewer.stop()
+    assert known[:8].all() and not known[8:].any()
+
+
 def shares_of_height(camera, points):
     """Where points are in a camera's picture, from its upper edge (0) to its lower one (1). -> (M,)"""
     ahead = camera.look_at - camera.position
