@@ -53,6 +53,11 @@ class DenoisingTrace:
         front, window = self.scene.slice(0, start), estimate.slice(0, stop - start)
         return cat_time([front, window])
 
+    def permute_agents(self, agents: Tensor) -> DenoisingTrace:
+        """Agents in another order, or some of them. agents: (P,) int"""
+        scene, estimates = self.scene.permute_agents(agents), self.estimates.permute_agents(agents)
+        return DenoisingTrace(scene, self.levels[..., agents], self.start, estimates)
+
     def save(self, path: str | Path) -> Path:
         """Write one npz that needs no unpickling. Returns the path written, with that suffix."""
         path = suffixed(path, ".npz")
@@ -85,12 +90,16 @@ class DenoisingTrace:
                 fps=float(meta["fps"]),
                 body=str(meta["body"]),
                 names=tuple(meta["names"]),
+                valid=arrays.get("valid"),
                 given=arrays.get("given"),
             )
             require_rotations(scene, "its sample")
             R = len(arrays["levels"])
             estimates = scene.repeat(R).replace(
-                body_rot=arrays["estimate_body_rot"].float(), T_world_root=arrays["estimate_T_world_root"], names=()
+                body_rot=arrays["estimate_body_rot"].float(),
+                T_world_root=arrays["estimate_T_world_root"],
+                valid=None,
+                names=(),
             )
             return DenoisingTrace(scene, arrays["levels"], arrays["start"], estimates)
         except (OSError, KeyError, TypeError, ValueError, *DAMAGED) as error:

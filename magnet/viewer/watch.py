@@ -21,12 +21,15 @@ from magnet.viewer.scene_view import RenderOptions, SceneView
 CELL = 14
 
 
-def level_image(recording: DenoisingTrace, step: int) -> NDArray[np.uint8]:
-    """Noise levels after a step: full colour is clean, white is pure noise; the window is framed. -> (H, W, 3)"""
+def level_image(recording: DenoisingTrace, step: int, slots: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Noise levels after a step: full colour is clean, white is pure noise; the window is framed. -> (H, W, 3)
+
+    slots: of the recording's P people, which say their colours.
+    """
     levels = recording.levels[step].numpy().astype(float) / LEVELS  # (N, P)
-    N, P = levels.shape
+    N = len(levels)
     noise = levels.T[..., None]  # (P, N, 1)
-    cells = (1 - noise) * agent_colours(tuple(range(P)))[:, None] + noise * 255.0
+    cells = (1 - noise) * agent_colours(slots)[:, None] + noise * 255.0
     image = np.kron(cells, np.ones((CELL, CELL, 1)))
     image[::CELL], image[:, ::CELL] = 214, 214
     first = int(recording.start[step]) // TOKEN_FRAMES
@@ -73,11 +76,12 @@ class Viewer(ViewerBase):
 
     def _add_denoising(self, index: int) -> None:
         view, recording = self.views[index], self.views[index].take.recording
+        slots = view.take.slots
         assert recording is not None
         gui = self.server.gui
         with gui.add_folder("Denoising"):
             step = gui.add_slider("denoising step", 0, recording.steps, 1, recording.steps)
-            picture = gui.add_image(level_image(recording, recording.steps - 1), label="levels: time, people")
+            picture = gui.add_image(level_image(recording, recording.steps - 1, slots), label="levels: time, people")
             text = gui.add_markdown("")
 
         def show(_: Any) -> None:
@@ -86,7 +90,7 @@ class Viewer(ViewerBase):
                 done = at >= recording.steps
                 view.estimate = None if done else recording.at(at)
                 self.shown = -1
-            picture.image = level_image(recording, min(at, recording.steps - 1))
+            picture.image = level_image(recording, min(at, recording.steps - 1), slots)
             text.content = "finished" if done else f"expected after step {at + 1} of {recording.steps}"
             self.draw()
 

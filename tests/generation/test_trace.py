@@ -82,6 +82,15 @@ def test_a_recording_says_what_was_given(model, start, tmp_path: Path) -> None:
     assert not given[0, 16:, 1].any()
 
 
+def test_a_recording_says_which_frames_are_not_valid(model, start, tmp_path: Path) -> None:
+    recording = record(model, start, JointFuture(), 16, 16, SamplerOptions(steps=2), generator())
+    valid = torch.arange(recording.scene.frames)[None] != 3
+    marked = replace(recording, scene=recording.scene.replace(valid=valid))
+    again = DenoisingTrace.load(marked.save(tmp_path / "steps"))
+    assert again.scene.valid is not None and torch.equal(again.scene.valid, valid)
+    assert again.at(1).frames == recording.at(1).frames
+
+
 def test_another_frame_rate_is_refused(start) -> None:
     with pytest.raises(ValueError, match="the scene runs at 60 fps, the model at 30: bring it there"):
         record(None, start.replace(fps=60.0), JointFuture(), 16, 16)  # type: ignore[arg-type]
@@ -96,7 +105,7 @@ def test_other_files_are_refused(tmp_path: Path, start) -> None:
 
 def test_the_picture_of_levels_pales_with_noise(model, start) -> None:
     recording = record(model, start, JointFuture(), 16, 16, SamplerOptions(steps=3), generator())
-    first, last = level_image(recording, 0), level_image(recording, recording.steps - 1)
+    first, last = (level_image(recording, step, (0, 1)) for step in (0, recording.steps - 1))
     assert first.shape == last.shape == (2 * 14, 8 * 14, 3)
     centre = np.s_[5:9, 7 * 14 + 5 : 7 * 14 + 9]
     assert first[centre].mean() > last[centre].mean() + 30

@@ -11,6 +11,7 @@ from magnet.body import Body
 from magnet.export.npz import save_smplx
 from magnet.export.page.takes import same_length, take, takes
 from magnet.export.reading import Reading
+from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from magnet.viewer.takes import read_takes
@@ -42,6 +43,15 @@ def test_absent_people_are_not_shown_and_the_others_keep_their_slots(scene: Scen
     shown = take("x", scene.select([0]).replace(present=present))
     assert shown.slots == (0, 2)
     assert shown.scene.agents == 2
+
+
+def test_steps_of_denoising_show_nobody_who_is_absent(scene: Scene) -> None:
+    some = scene.select([0]).replace(present=torch.tensor([[True, False, True]]))
+    levels = torch.arange(3).expand(2, some.frames // 4, 3)
+    steps = DenoisingTrace(some, levels, torch.zeros(2, dtype=torch.long), some.repeat(2))
+    shown = take("x", some, recording=steps).recording
+    assert shown is not None and shown.at(1).present.tolist() == [[True, True]]
+    assert shown.levels.shape[-1] == 2 and shown.levels.unique().tolist() == [0, 2]
 
 
 def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scene) -> None:

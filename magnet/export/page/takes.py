@@ -28,7 +28,7 @@ class ShownTake:
     Attributes:
         slots: the people's slots, which say their colours.
         known: (T, P) bool, frames that the model was given; the scene's own `given`, or False where that says nothing.
-        recording: its denoising steps, if they were recorded.
+        recording: its denoising steps, if they were recorded, of the same people.
     """
 
     label: str
@@ -61,7 +61,10 @@ def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace |
     slots = scene.present[0].nonzero()[:, 0]
     if not len(slots) or not scene.frames:
         raise ValueError(f"{label}: {scene.frames} frames of {len(slots)} people, so there is nothing to see")
-    shown = (scene if len(slots) == scene.agents else scene.permute_agents(slots)).to("cpu")
+    shown = scene.to("cpu")
+    if len(slots) < scene.agents:
+        shown = shown.permute_agents(slots.cpu())
+        recording = recording and recording.permute_agents(slots.cpu())
     for name in ("T_world_root", "body_rot"):
         broken = ~getattr(shown, name)[0].flatten(1).isfinite().all(dim=1)
         if bool(broken.any()):
