@@ -119,12 +119,8 @@ def measure(given: argparse.Namespace, way: str, store: Path) -> dict[str, Any]:
     if device != "cpu":
         there: Any = data.store("train").to(device)
         frames, clearance = data.window_frames, data.augment.compose_clearance
-        if not resident:
-            loader.fetch = lambda draw: there.fetch(draw, frames, clearance)
-        loader.gather = {
-            "for a GPU": lambda rows: rows,
-            "in memory": lambda draw: there.gather(draw, frames, clearance),
-        }.get(way, lambda rows: there.finish(rows, clearance))
+        loader.fetch = lambda draw: there.fetch(draw, frames, clearance)
+        loader.finish = (lambda rows: rows) if way == "for a GPU" else lambda rows: there.finish(rows, clearance)
     begin = time.perf_counter()
     batches = itertools.chain.from_iterable(itertools.repeat(loader))
     next(batches)
@@ -215,7 +211,7 @@ def through_prepare(download: Path, store: Path, frames: int, workers: int, take
     from magnet.datamodules.fakes import dd100
 
     begin = time.perf_counter()
-    dd100.write(download, takes=len(dd100.NAMES), frames=take_frames)
+    dd100.write_scenes(download, dd100.scenes(len(dd100.NAMES), take_frames, seed=0))
     folder = download / "data/motion/smplx/all"
     splits = {dd100.name(number): "train" for number in range(len(dd100.NAMES))}
     splits |= {dd100.name(1): "val", dd100.name(2): "test"}
