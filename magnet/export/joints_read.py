@@ -16,6 +16,7 @@ from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, L_ANKLE, L_FOOT, L_HIP
 from magnet.export.cutting import kept_frames
 from magnet.export.joints_table import JointTable, read_table
 from magnet.export.naming import recognised
+from magnet.export.npz import require_own_rate
 from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
 from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP
 from magnet.export.rig_motion import Bools, Floats
@@ -49,15 +50,17 @@ def load_joints(
 
     Args:
         unit, up, joints: as `magnet.export.reading.Reading` has them; up is found from where torsos point.
-        fps: the table's frames a second, if it says no time.
+        fps: the table's frames a second, or of its count of frames, if it says no time.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: as `read_table`, unknown joints, no unit, no rate, nobody, or no fit.
+        ValueError: as `read_table`, unknown joints, no unit, no rate, another rate than the times', nobody, or no fit.
     """
     path, table = Path(path), read_table(path)
     rate = table.fps or (fps and fps / table.step)
+    if table.fps:
+        require_own_rate(path, table.fps * table.step, fps)
     if rate is None:
         raise ValueError(f"{path}: says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
     if up is not None and up not in UP:

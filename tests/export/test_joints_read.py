@@ -112,6 +112,13 @@ def test_a_table_without_a_time_asks_for_the_rate_and_a_file_a_person_is_one_sce
     assert got.fps == 60 and off(got, salsa, body) < 0.02
 
 
+def test_another_rate_than_that_of_the_times_is_refused(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    path = tracked(salsa, body, tmp_path / "a.csv")
+    assert read(path, options=Reading(in_fps=30)).scene.fps == 30
+    with pytest.raises(ValueError, match=r"a\.csv: says 30 frames a second; --in_fps 60 is for files that say nothing"):
+        read(path, options=Reading(in_fps=60))
+
+
 def test_unknown_joints_can_be_told_and_a_wrong_axis_or_unit_is_doubted(
     salsa: Scene, body: Body, tmp_path: Path
 ) -> None:
