@@ -121,7 +121,7 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
     """Labelled scenes with B = 1 each.
 
     Raises:
-        ValueError: no scene, or scenes of different length.
+        ValueError: no scene, or scenes of different lengths or frame rates.
     """
     if isinstance(scenes, Scene):
         names = scenes.names or ("",) * scenes.scenes
@@ -137,6 +137,9 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
     lengths = sorted({scene.frames for _, scene in pairs})
     if len(lengths) != 1 or lengths[0] == 0:
         raise ValueError(f"got scenes of {lengths or 'no'} frames, expected one length; cut them with Scene.slice")
+    rates = sorted({scene.fps for _, scene in pairs})
+    if len(rates) > 1:
+        raise ValueError(f"got scenes of {rates} frames a second, expected one rate: magnet.export.resampled")
     return pairs
 
 

@@ -31,7 +31,7 @@ def contact_sheet(
     """Write a PNG whose rows are scenes (samples, methods, the truth) and whose columns are moments.
 
     Args:
-        scenes: a scene, each of its B a row, or labelled scenes; all of one length.
+        scenes: a scene, each of its B a row, or labelled scenes; all of one length and frame rate.
         columns: how many moments, evenly spread from the first frame to the last.
         context_frames: number of first frames given to the model, if the scene does not say; they are pink, and times
             count from the last one.
@@ -60,7 +60,7 @@ def contact_sheet(
     draw = ImageDraw.Draw(page)
     if title:
         draw.text((12 * unit, 22 * unit), drawable(title), fill=INK, font=font(20 * unit), anchor="lm")
-    context = context_frames or people[0].context
+    context = people[0].context
     for i, moment in enumerate(moments):
         ink = PINK if moment < context else GENERATED
         place = (left + (i + 0.5) * cell[0], top - 13 * unit)

@@ -61,7 +61,7 @@ def render_video(
     """Write a film of one scene, or of several side by side at one scale and from one side.
 
     Args:
-        scenes: a scene, each of its B a panel, or labelled scenes; all of one length.
+        scenes: a scene, each of its B a panel, or labelled scenes; all of one length and frame rate.
         path: .mp4 (needs PyAV), .gif or .webp.
         context_frames: number of first frames given to the model, if the scene does not say; they are pink and marked
             in the time bar.

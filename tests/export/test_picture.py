@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from magnet.body import Body
@@ -45,6 +46,15 @@ def test_columns_spread_from_first_to_last_frame(duet: Scene, body: Body, tmp_pa
         duet, tmp_path / "b.png", context_frames=0, frames=[0, 6, 11], body=body, style="skeleton", cell=(80, 80)
     )
     assert every.read_bytes() == named.read_bytes()
+
+
+def test_times_count_from_what_the_scene_says_was_given(duet: Scene, body: Body, tmp_path: Path) -> None:
+    given = (torch.arange(12) < 4)[None, :, None].expand(1, 12, 2)
+    pages = [
+        contact_sheet(duet.replace(given=given), tmp_path / f"{n}.png", context_frames=n, body=body, style="skeleton")
+        for n in (0, 4, 8)
+    ]
+    assert len({page.read_bytes() for page in pages}) == 1
 
 
 def test_bad_frames_and_suffixes_are_named(duet: Scene, body: Body, tmp_path: Path) -> None:

@@ -204,6 +204,8 @@ def test_bad_input_is_named_and_leaves_no_file(duet: Scene, body: Body, tmp_path
         render(context=13)
     with pytest.raises(ValueError, match=r"\[11, 12\] frames"):
         render({"a": duet, "b": duet.slice(0, 11)})
+    with pytest.raises(ValueError, match=r"\[30\.0, 60\.0\] frames a second, expected one rate"):
+        render({"a": duet, "b": duet.replace(fps=60.0)})
     with pytest.raises(ValueError, match="ghosts have 11 frames"):
         render(ghosts=duet.slice(0, 11))
     T_world_root = duet.T_world_root.clone()
