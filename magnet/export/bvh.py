@@ -63,9 +63,8 @@ def save_bvh(scene: Scene, path: str | Path, body: Body, *, unit: Unit = "m", na
     if not people.scenes:
         raise ValueError("nobody is present in the scene, so there is no skeleton to write")
     written = []
-    for p, each in enumerate(
-        paths_of(suffixed(path, ".bvh").with_suffix(".bvh"), scene.present[0].nonzero()[:, 0].tolist())
-    ):
+    paths = paths_of(suffixed(path, ".bvh"), scene.present[0].nonzero()[:, 0].tolist())
+    for p, each in enumerate(paths):
         offsets = offsets_of(body.rest_joints(people.betas[p, 0].detach().cpu().double())).numpy() * PER_METRE[unit]
         root = people.T_world_root[p, :, 0].detach().cpu().double()
         local = torch.cat([root[:, None, :3, :3], people.body_rot[p, :, 0].detach().cpu().double()], dim=1)

@@ -51,11 +51,13 @@ def test_what_was_there_stays_where_the_disk_is_full(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if not path.is_symlink()} == before
 
 
-@pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb", ".HTML", ".CSV"])
+@pytest.mark.parametrize("suffix", [".GIF", ".PNG", ".WebP", ".NPZ", ".Glb", ".HTML", ".CSV", ".BVH", ".Vrma"])
 def test_a_suffix_may_be_in_capitals(suffix, duet: Scene, body: Body, tmp_path: Path):
-    (path,) = formats.write(duet.slice(0, 2), tmp_path / f"a{suffix}", body, style="skeleton")
+    alone = duet.people().select([0]).slice(0, 2)
+    (path,) = formats.write(alone, tmp_path / f"a{suffix}", body, style="skeleton")
     assert path.stat().st_size > 100
     assert path.name == f"a{suffix}"
+    assert formats.files_of(tmp_path / f"a{suffix}", [[0]]) == [path]
 
 
 def test_a_frame_without_rotations_is_not_written_as_motion(duet: Scene, body: Body, tmp_path: Path):
