@@ -113,4 +113,5 @@ class HoldPose:
             body_rot=last.body_rot.expand(-1, horizon, -1, -1, -1, -1).clone(),
             T_world_root=last.T_world_root.expand(-1, horizon, -1, -1, -1).clone(),
             valid=None,
+            given=None,
         )

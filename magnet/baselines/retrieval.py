@@ -101,6 +101,7 @@ class Retrieval:
             T_world_root=torch.where(there, T_world_root.to(context.device), eye),
             betas=torch.where(context.present[..., None], betas, context.betas),
             valid=None,
+            given=None,
         )
 
     def best_slots(self, context: Scene, chosen: Tensor, now: Tensor, then: Tensor) -> Tensor:

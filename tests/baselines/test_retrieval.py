@@ -191,6 +191,15 @@ def test_what_comes_back_has_the_contexts_people(train: Scene, which: str) -> No
     assert bool(got.T_world_root.isfinite().all()) and bool(got.body_rot.isfinite().all())
 
 
+@pytest.mark.parametrize(("which", "horizon"), [("nearest", CONTEXT), ("random", CONTEXT), ("hold", 1)])
+def test_nothing_of_what_comes_back_was_given(train: Scene, which: str, horizon: int) -> None:
+    """Also where it is as long as what was."""
+    context = wander(2, 2, seed=11).slice(0, CONTEXT)
+    context = context.replace(given=torch.ones(2, CONTEXT, 2, dtype=torch.bool))
+    baseline = {"nearest": NearestNeighbour(train), "random": RandomSample(train), "hold": HoldPose()}[which]
+    assert baseline(context, horizon).given is None
+
+
 def test_held_pose_is_the_last_known_frame() -> None:
     context = wander(2, 2, seed=1).slice(0, CONTEXT)
     held = HoldPose()(context, 5)
