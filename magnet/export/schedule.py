@@ -163,7 +163,7 @@ def draw_schedule(
         ValueError: not a .png, or too few moments.
     """
     path = Path(path)
-    if path.suffix != ".png":
+    if path.suffix.lower() != ".png":
         raise ValueError(f"{path.name}: pictures are written as .png")
     title, subtitle = drawable(title), drawable(subtitle)
     rows = moments(schedule, count)

@@ -123,7 +123,7 @@ def test_dashes_have_the_colour_of_who_does_not_see(tmp_path: Path) -> None:
 def test_a_long_schedule_stays_readable(tmp_path: Path) -> None:
     grid = Grid(tokens=1200, agents=3, context=4, steps=4, window=16, stride=12)
     schedule = plan("joint_future", grid)
-    path = draw_schedule(schedule, tmp_path / "plan.png")
+    path = draw_schedule(schedule, tmp_path / "plan.PNG")
     with Image.open(path) as image:
         assert max(image.size) < 2500
     assert path.stat().st_size < 80_000
