@@ -252,10 +252,8 @@ def check_download(
     clips: dict[str, tuple[list[str], list[int], list[int]]] = {}
     for take, part in convert_all(job, takes, lambda take: None, workers, progress):
         if part.error is None and len(found.scenes) < SHOWN:
-            P, T = part.people[0], part.frames[0]
-            rows = part.rows[: P * T].reshape(P, T)[:, :SHOWN_FRAMES]
-            found.scenes.append((part.names[0], scene_of(rows, part.betas[:P], body.id, FPS)))
-        parts[take.name] = part
+            found.scenes.append((part.names[0], _first_scene(part, body)))
+        parts[take.name] = part.without_rows()  # downloads are larger than the memory
     for take in takes:
         part = parts[take.name]
         if part.error is not None:
@@ -274,6 +272,13 @@ def check_download(
     found.notes += said
     found.count_skipped(len(takes), short)
     return found
+
+
+def _first_scene(part: ConvertedTake, body: Body) -> Scene:
+    """The beginning of a take's first clip, for the picture."""
+    P, T = part.people[0], part.frames[0]
+    rows = part.rows[: P * T].reshape(P, T)[:, :SHOWN_FRAMES]
+    return scene_of(rows, part.betas[:P], body.id, FPS)
 
 
 def short_parts(reader: Reader, takes: Sequence[Take], least: int) -> tuple[int, list[str]]:

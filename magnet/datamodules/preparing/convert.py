@@ -227,7 +227,11 @@ class ConvertedTake:
                 np.lib.format.write_array(out, array, allow_pickle=False)
 
         write_whole(path.parent, path.name, write)
-        return replace(self, rows=self.rows[:0])
+        return self.without_rows()
+
+    def without_rows(self) -> ConvertedTake:
+        """All but its rows, whose memory is free then: an empty slice would hold it."""
+        return replace(self, rows=np.zeros(0, dtype=ROW))
 
     @staticmethod
     def load(path: Path, rows: bool = True) -> ConvertedTake:
