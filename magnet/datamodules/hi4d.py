@@ -13,7 +13,7 @@ import numpy as np
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, open_npz
-from magnet.datamodules.reading.fields import listing, person, side_by_side
+from magnet.datamodules.reading.fields import listing, natural, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
 
@@ -64,7 +64,7 @@ class Hi4DReader(Reader):
         for number, pair in self._pairs():
             split: Split = "test" if number in self.test_pairs else "val" if number in self.val_pairs else "train"
             for action in sorted(path for path in pair.iterdir() if path.is_dir() and not path.name.startswith(".")):
-                frames = sorted((action / "smpl").glob("*.npz"))
+                frames = sorted((action / "smpl").glob("*.npz"), key=lambda path: natural(path.stem))
                 takes.append(Take(name := f"{pair.name}_{action.name}", (action / "meta.npz", *frames), split, name))
         return takes
 

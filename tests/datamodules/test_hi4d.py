@@ -49,6 +49,17 @@ def meta(**changes: Any) -> Callable[[Path], None]:
     return frame(lambda held: held.update(changes), "meta.npz")
 
 
+def test_frames_whose_numbers_have_no_leading_zeros_are_in_order(root: Path) -> None:
+    reader = Hi4DReader(root)
+    action = next(reader.root.glob("pair*/*"))
+    before = reader.read(reader.found()[0])
+    for path in sorted((action / "smpl").glob("*.npz")):
+        path.rename(path.with_stem(str(int(path.stem) - 3)))  # 8 to 13
+    meta(start=8, end=13)(action)
+    after = reader.read(reader.found()[0])
+    assert np.array_equal(after.transl, before.transl)
+
+
 DAMAGED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "truncated": (lambda action: cut(action / "smpl/000013.npz"), r"000013\.npz: not an npz archive"),
     "empty": (lambda action: (action / "smpl/000013.npz").write_bytes(b""), r"000013\.npz: not an npz archive"),
