@@ -88,6 +88,7 @@ def main() -> None:
         print(f"level {name}: {told}")
     if options.out:
         facts = {"scenes": scenes.scenes, "checkpoint": options.ckpt_path, "takes": options.takes, **machine()}
+        options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps({"rows": rows, "meta": facts}, indent=1))
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import lightning as L
 
 from magnet.cli.provenance import machine, provenance
-from magnet.cli.train import quiet
+from magnet.cli.quiet import quiet
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
 from magnet.denoiser.module import Denoiser

@@ -75,7 +75,9 @@ class Runner:
 
     def _run_all(self, todo: Sequence[Cell]) -> None:
         for number, cell in enumerate(todo):
-            left = sum(self.seconds(each) for each in todo[number:])
+            kinds = {each.kind: each for each in todo[number:]}
+            took = {kind: self.seconds(each) for kind, each in kinds.items()}  # once a kind: it reads what is done
+            left = sum(took[each.kind] for each in todo[number:])
             full = BAR * number // max(len(todo), 1)
             bar = "#" * full + "." * (BAR - full)
             self.say(f"[{bar}] {number + 1}/{len(todo)} {cell.name}, about {clock(left)} left")

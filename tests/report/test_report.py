@@ -147,6 +147,22 @@ def test_a_training_that_fails_is_told_at_every_cell_that_needs_it(tmp_path: Pat
     assert all("the training ended with code 2" in said for said in runner.failed.values())
 
 
+def test_the_time_left_is_told_without_reading_what_is_done_for_every_cell_that_is_left(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    class Counted(Store):
+        def of_kind(self, kind: str) -> list[float]:
+            asked.append(kind)
+            return [60.0]
+
+    said: list[str] = []
+    trained = [cell for cell in cells_of(TABLES["5"](PLAN)) if cell.model is not None]
+    Runner(Counted(tmp_path), lambda _: 2, PLAN.configs, "duet", say=said.append).run(trained)
+    rounds = [line for line in said if line.startswith("[")]
+    assert f"about {run.clock(60.0 * len(rounds))} left" in rounds[0]
+    assert 0 < len(asked) <= len({cell.kind for cell in trained}) * len(rounds)
+
+
 # -- the command -----------------------------------------------------------------------------------
 
 
