@@ -124,8 +124,8 @@ class LiveApp(ViewerBase):
         for view in self.views:
             view.set_visible(False)
         if key not in self.casts:
-            first = take(f"cast {len(self.casts)}", scene)
-            self.casts[key] = SceneView(self.server, "/stage", self.body, first, np.zeros(3), self.render, label=False)
+            name = f"/stage/cast_{len(self.casts)}"
+            self.casts[key] = SceneView(self.server, name, self.body, take("", scene), np.zeros(3), self.render)
         self.views = [self.casts[key]]
         self.views[0].take = take("", scene)
         self.views[0].set_style(self.render)

@@ -35,29 +35,26 @@ class RenderOptions:
 
 
 class SceneView:
-    """A take on the stage at `offset` metres.
+    """A take on the stage at `offset` metres, with its label above it.
 
     Args:
         server: viser's.
-        parent: parent node of the take.
+        name: node of the take, of no other one: viser would put it in that one's place.
         truth: a scene (B = 1) of the same frames, shown as ghosts.
-        label: write the take's label above it.
     """
 
     def __init__(
         self,
         server: Any,
-        parent: str,
+        name: str,
         body: Body,
         take: ShownTake,
         offset: Array,
         render: RenderOptions,
         truth: Scene | None = None,
-        label: bool = True,
     ) -> None:
         self.server, self.body, self.take, self.truth, self.render = server, body, take, truth, render
-        self.name = f"{parent}/take_{''.join(c if c.isalnum() else '_' for c in take.label)}"
-        self.offset = offset
+        self.name, self.offset = name, offset
         self.root = server.scene.add_frame(self.name, show_axes=False, position=tuple(float(x) for x in offset))
         self.own = agent_colours(take.slots)
         self.mesh_cache: dict[tuple[Style, bool], PeopleView] = {}  # people and ghosts in the styles shown so far
@@ -66,7 +63,7 @@ class SceneView:
         self.trails: Trails | None = None
         self.marks = Marks(server, f"{self.name}/marks", len(take.slots), take.scene.fps)
         self.shades = Shades(server, f"{self.name}/shades", len(take.slots))
-        self.label = server.scene.add_label(f"{self.name}/label", take.label) if label and take.label else None
+        self.label = server.scene.add_label(f"{self.name}/label", take.label) if take.label else None
         self.facts: dict[str, float] = {}
         self.plainly_lit = False
         self.estimate: Scene | None = None

@@ -61,9 +61,10 @@ class Viewer(ViewerBase):
         super().__init__(body, render, host, port, takes[0].label if len(takes) == 1 else "magnet")
         self.clock = Clock(max(each.frames for each in takes), takes[0].scene.fps)
         with self.server.atomic():
-            for each, offset in zip(takes, in_a_row(takes), strict=True):
+            for number, (each, offset) in enumerate(zip(takes, in_a_row(takes), strict=True)):
                 ghost = None if truth is None else same_length(truth, each)
-                self.views.append(SceneView(self.server, "/stage", body, each, offset, self.render, ghost))
+                name = f"/stage/take_{number}"
+                self.views.append(SceneView(self.server, name, body, each, offset, self.render, ghost))
             self.frame_all()
             self.add_timeline()
             if any(each.recording is not None for each in takes):

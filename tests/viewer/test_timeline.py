@@ -78,6 +78,20 @@ def test_a_take_that_ends_before_the_others_is_not_given_again(body) -> None:
     assert known[:8].all() and not known[8:].any()
 
 
+def test_takes_whose_names_differ_in_signs_alone_stand_side_by_side(body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    scene = random_scene(1, 24, 1, torch.Generator().manual_seed(1))
+    viewer = Viewer([take(label, scene) for label in ("a-b", "a_b")], body, port=0)
+    try:
+        viewer.clock.seek(5)
+        viewer.draw()
+        assert len({view.name for view in viewer.views}) == 2
+    finally:
+        viewer.stop()
+
+
 def shares_of_height(camera, points):
     """Where points are in a camera's picture, from its upper edge (0) to its lower one (1). -> (M,)"""
     ahead = camera.look_at - camera.position

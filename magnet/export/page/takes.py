@@ -112,7 +112,7 @@ def in_a_row(takes: Sequence[ShownTake]) -> list[Array]:
 
 
 def numbered(takes: list[ShownTake]) -> list[ShownTake]:
-    """The takes with labels that differ, for they name nodes of the scene."""
+    """The takes with labels that differ, by which one is chosen."""
     labels = [each.label for each in takes]
     return [
         replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
