@@ -215,15 +215,14 @@ def measure(
     def middle(name: str) -> float:
         return median(each[name] for each in timings)
 
-    made = frames if context else frames + context
     return Speed(
         1000 * middle("evaluation"),
         1000 * middle("floor"),
         median(each["evaluation"] / each["floor"] for each in timings),
         operators,
-        stats.calls / made,
-        stats.evaluations / made,
-        case.batch * made / middle("took"),
+        stats.calls / frames,
+        stats.evaluations / frames,
+        case.batch * frames / middle("took"),
         1000 * middle("first"),
         memory_mib(),
     )

@@ -42,7 +42,7 @@ FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
 """Whose shape numbers go with so many rotation numbers a frame; 66, the body's alone, may be anybody's."""
 PERSON = "name of the person"
 """Our key for what somebody is called in a dict of people."""
-OPTIONAL = ("gender", SCALE, "body", "valid")
+OPTIONAL = ("gender", SCALE, "body")
 
 
 @dataclass(frozen=True)

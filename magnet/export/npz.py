@@ -33,6 +33,10 @@ from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene
 
 SMPLX_JOINTS = 55
+STANDING, LYING = (0.4, 1.4), 0.15
+"""Metres of a pelvis over the floor: of who stands or sits, and at least."""
+HIGHEST, MOST_TURNED = 30.0, 9.0
+"""Metres of a pelvis over the floor, and radians of a turn, which files in metres and radians do not hold."""
 
 
 def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = False) -> list[Path]:
@@ -238,12 +242,6 @@ def unit_against(scenes: Sequence[Scene], unit: str) -> list[str]:
                 f"{other}: --in_unit {other} (unit={other!r})"
             ]
     return []
-
-
-STANDING, LYING = (0.4, 1.4), 0.15
-"""Metres of a pelvis over the floor: of who stands or sits, and at least."""
-HIGHEST, MOST_TURNED = 30.0, 9.0
-"""Metres of a pelvis over the floor, and radians of a turn, which files in metres and radians do not hold."""
 
 
 def _number(path: Path, key: str, file: Mapping[str, np.ndarray], what: str) -> float:

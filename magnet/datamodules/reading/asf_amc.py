@@ -21,6 +21,7 @@ from magnet.export.bvh_read import about
 from magnet.motion.resample import slerp
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 INCH = 0.0254
 TRANSLATIONS, ROTATIONS = ("tx", "ty", "tz"), ("rx", "ry", "rz")
@@ -114,8 +115,8 @@ def read_asf(path: str | Path) -> AsfSkeleton:
         ValueError: not an ASF file, or a line makes no sense; names the line.
     """
     path = Path(path)
-    root, bones, bone, section = _Bone(name="root"), {"root": (one := _Bone(name="root"))}, _Bone(), ""
-    root, unit, degrees, children = one, 1.0, True, 0
+    root, bone, section = _Bone(name="root"), _Bone(), ""
+    bones, unit, degrees, children = {"root": root}, 1.0, True, 0
     for where, words in said_lines(path):
         key, rest = words[0].lower(), words[1:]
         if key.startswith(":"):
@@ -194,9 +195,6 @@ def _assembled(path: Path, bones: dict[str, _Bone], unit: float, degrees: bool) 
         degrees=degrees,
         path=path,
     )
-
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from magnet.body.apart import widened
 from magnet.body.fit import swing
-from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, euler, together
+from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, Bools, Floats, euler, together
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.motion.rotations import from_rotvec, geodesic, to_quat
+from magnet.motion.runs import true_runs
 from magnet.motion.scene import BODY_JOINTS, FPS
 
 from magnet.body.joints import (  # isort: skip
@@ -22,12 +23,6 @@ from magnet.body.joints import (  # isort: skip
     PARENTS, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP, R_KNEE, R_SHOULDER, R_WRIST, SHOULDERS, SPINE1, SPINE2,
     SPINE3, TOES, WRISTS,
 )  # fmt: skip
-
-
-from dataclasses import replace
-
-from magnet.datamodules.reading.asf_amc import Bools, Floats
-from magnet.motion.runs import true_runs
 
 JUMP = 0.15
 """Metres between two frames: 9 m/s at 60 fps, which no body joint of the recordings reaches by itself."""

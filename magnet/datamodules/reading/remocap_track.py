@@ -14,6 +14,7 @@ from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length
 from magnet.datamodules.reading.asf_amc import euler
 from magnet.datamodules.reading.fields import mapping
 from magnet.datamodules.reading.recording import DataError
+from magnet.motion.bvh import bvh_header
 from magnet.unpickle import contents, load_pickle
 
 from magnet.body.joints import (  # isort: skip
@@ -21,8 +22,18 @@ from magnet.body.joints import (  # isort: skip
     R_KNEE, R_SHOULDER, R_WRIST,
 )  # fmt: skip
 
-
-from magnet.motion.bvh import bvh_header
+RATE = 50.0
+MAP = {
+    PELVIS: "Hips", L_HIP: "LeftUpLeg", R_HIP: "RightUpLeg", L_KNEE: "LeftLeg", R_KNEE: "RightLeg",
+    L_ANKLE: "LeftFoot", R_ANKLE: "RightFoot", L_FOOT: "LeftToeBase", R_FOOT: "RightToeBase", NECK: "Neck",
+    HEAD: "Head", L_SHOULDER: "LeftArm", R_SHOULDER: "RightArm", L_ELBOW: "LeftForeArm", R_ELBOW: "RightForeArm",
+    L_WRIST: "LeftHand", R_WRIST: "RightHand",
+}  # fmt: skip
+"""Our joint: theirs. Their spine has six joints and ours three, so only its ends are used."""
+CLOSE = 0.01
+"""Metres within which the skeleton's own rotations must lead to its positions."""
+CHECKED = 40
+"""Frames, evenly spread, that this is tried on."""
 
 
 @dataclass(frozen=True)
@@ -78,20 +89,6 @@ def read_bvh_header(path: Path) -> BvhSkeleton:
         frames=said.frames,
         seconds=said.seconds,
     )
-
-
-RATE = 50.0
-MAP = {
-    PELVIS: "Hips", L_HIP: "LeftUpLeg", R_HIP: "RightUpLeg", L_KNEE: "LeftLeg", R_KNEE: "RightLeg",
-    L_ANKLE: "LeftFoot", R_ANKLE: "RightFoot", L_FOOT: "LeftToeBase", R_FOOT: "RightToeBase", NECK: "Neck",
-    HEAD: "Head", L_SHOULDER: "LeftArm", R_SHOULDER: "RightArm", L_ELBOW: "LeftForeArm", R_ELBOW: "RightForeArm",
-    L_WRIST: "LeftHand", R_WRIST: "RightHand",
-}  # fmt: skip
-"""Our joint: theirs. Their spine has six joints and ours three, so only its ends are used."""
-CLOSE = 0.01
-"""Metres within which the skeleton's own rotations must lead to its positions."""
-CHECKED = 40
-"""Frames, evenly spread, that this is tried on."""
 
 
 def file_like(folder: Path, pattern: str, usual: str) -> Path:

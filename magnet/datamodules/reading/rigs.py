@@ -25,7 +25,7 @@ from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm", "mm", "inch", "foot"]
 LIMBS = sorted({joint + side for joint in TARGETS if joint != NECK for side in (0, 1)})
-MOST_SHAPE = 5.0
+LIKELY_SHAPE = 5.0
 """Largest shape number: unusual proportions are left as a residual rather than fitted by an impossible body."""
 SHOWN = 12
 
@@ -72,7 +72,7 @@ class RigTrack:
     def onto(self, body: Body, up: Axis, fps: float) -> tuple[Scene, Tensor]:
         """The person on `body`; fitted, unless the skeleton is the body's own."""
         (skeleton,) = _skeletons([self.resampled(fps)], self.up or up.lstrip("+"))
-        scene, _ = onto(skeleton, body, self.worst, MOST_SHAPE)
+        scene, _ = onto(skeleton, body, self.worst, LIKELY_SHAPE)
         joints, theirs = _limbs(skeleton)
         off = body.joints(scene)[0, :, 0, joints] - torch.from_numpy(skeleton.at[:, theirs]).float()
         return scene, off.norm(dim=-1).mean(dim=-1)
