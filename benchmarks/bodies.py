@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 import magnet
 from magnet.body import load_body
@@ -87,7 +86,8 @@ def measured(model, scene: Scene, name: str, frames: int, samples: int, options:
     made = made.permute_agents(torch.arange(scene.agents)).slice(context)
     body = load_body()
     joints = body.joints(made.replace(given=None)).unflatten(0, (scene.scenes, samples)).transpose(0, 1)
-    scored: Tensor = ~made.given[0]
+    assert made.given is not None
+    scored = ~made.given[0]
     metrics = all_metrics()
     truth = body.joints(scene.slice(context, context + frames)) if scene.frames >= context + frames else joints[0]
     metrics.update(joints, truth, scene.present, agents=scored)

@@ -233,8 +233,9 @@ def main() -> None:
         for k in range(clip.frames // WINDOW)
     ]
     chosen = [starts[i * len(starts) // given.scenes] for i in range(given.scenes)]
-    kind = "history" if given.guidance else "none"
-    guidance = Guidance(kind, given.guidance, stabilization_level=given.stabilization_level)
+    guidance = Guidance(
+        "history" if given.guidance else "none", given.guidance, stabilization_level=given.stabilization_level
+    )
     sampler = SamplerOptions(given.steps, None, given.pyramid_offset, noise_scale=given.noise_scale, guidance=guidance)
     generator = torch.Generator().manual_seed(1111)
     began = time.perf_counter()

@@ -13,6 +13,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 
@@ -56,12 +57,18 @@ def main() -> None:
 
             same = noisy, levels(), present
             clean = model.denoise(*same)
+
+            def at_new_levels(
+                x: torch.Tensor = noisy, present: torch.Tensor = present, clean: torch.Tensor = clean
+            ) -> torch.Tensor:
+                return posterior(clean, x, levels(len(x)), present, model.normalizer)
+
             plain, packed, again, new = medians(
                 options.rounds,
-                lambda same=same: model.denoise(*same),
-                lambda same=same: model.denoise(*same, network=network),
-                lambda same=same, clean=clean: posterior(clean, *same, model.normalizer),
-                lambda x=noisy, p=present, clean=clean: posterior(clean, x, levels(len(x)), p, model.normalizer),
+                partial(model.denoise, *same),
+                partial(model.denoise, *same, network=network),
+                partial(posterior, clean, *same, model.normalizer),
+                at_new_levels,
             )
             print(
                 f"people {people}, samples {samples}: network {plain:.1f} ms, lean {packed:.1f} ms, "

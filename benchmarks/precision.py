@@ -96,7 +96,7 @@ def times(made: Transformer, scenes: int, rounds: int = 40) -> dict[str, float]:
     present[:, :2] = True
     noisy = torch.randn(scenes, 16, layout.agents, layout.width)
     levels = torch.full(noisy.shape[:3], 500)
-    each = {"reference": made, **networks(made)}
+    each: dict[str, Callable[..., Tensor]] = {"reference": made, **networks(made)}
     spent: dict[str, list[float]] = {name: [] for name in each}
     for _ in range(rounds):
         for name, run in each.items():
