@@ -94,6 +94,7 @@ def main() -> None:
         axis.set(xlabel=label, xlim=(0, None), ylim=(0, 1.1 * max(line.values())))
     axes[0].set_ylabel("ms an evaluation")
     axes[-1].set_ylabel("ms an answer")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, metadata={"Date": None})
 
 

@@ -80,6 +80,7 @@ class Memory:
         axis = figure.subplots()
         axis.plot(seconds, self.held)
         axis.set(xlabel=f"seconds of {people} people", ylabel="memory, GB", ylim=(0, None))
+        path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=110)
 
 
@@ -184,6 +185,7 @@ def plotted(costs: list[Cost], path: Path) -> None:
     ):
         axis.plot(people, line, "o-")
         axis.set(xlabel="people", ylabel=label, ylim=(0, None))
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
