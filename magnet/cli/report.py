@@ -89,9 +89,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     wanted = chosen(runner, cells, given.only or [""], given.skip)
     todo = runner.missing(wanted)
     if given.dry_run:
-        for cell in todo:
-            print(f"{runner.seconds(cell):6.0f} s  {cell.name}")
-        total = clock(sum(map(runner.seconds, todo)))
+        times = runner.times(todo)
+        for cell, seconds in zip(todo, times, strict=True):
+            print(f"{seconds:6.0f} s  {cell.name}")
+        total = clock(sum(times))
         print(f"{len(wanted)} cells, {len(wanted) - len(todo)} done; the other {len(todo)} may take {total}")
         return 0
     if not given.page_only:

@@ -68,6 +68,11 @@ class Runner:
         took = self.store.of_kind(cell.kind)
         return statistics.median(took) if took else GUESSED[cell.kind]
 
+    def times(self, cells: Sequence[Cell]) -> list[float]:
+        """How long each of some cells may take, in seconds; what is done is read once for each kind."""
+        took = {kind: self.seconds(cell) for kind, cell in {cell.kind: cell for cell in cells}.items()}
+        return [took[cell.kind] for cell in cells]
+
     def run(self, cells: Sequence[Cell]) -> None:
         """Run what is missing, in order. What cannot be done is in `failed` then, with the reason."""
         with sharing():  # trainings of a seed see the same batches
@@ -75,9 +80,7 @@ class Runner:
 
     def _run_all(self, todo: Sequence[Cell]) -> None:
         for number, cell in enumerate(todo):
-            kinds = {each.kind: each for each in todo[number:]}
-            took = {kind: self.seconds(each) for kind, each in kinds.items()}  # once a kind: it reads what is done
-            left = sum(took[each.kind] for each in todo[number:])
+            left = sum(self.times(todo[number:]))
             full = BAR * number // max(len(todo), 1)
             bar = "#" * full + "." * (BAR - full)
             self.say(f"[{bar}] {number + 1}/{len(todo)} {cell.name}, about {clock(left)} left")
