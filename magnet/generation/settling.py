@@ -58,13 +58,16 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = tuple(
-    (Apart(body=left, arms=left), replace(SHOWN, iterations=6, inner=40, bend=bend, root=root, stand=16.0, hold=2.0))
-    for left, bend, root in ((0.07, 24000.0, 3.0), (0.07, 60000.0, 0.3), (0.1, 18000.0, 0.3))
+    (
+        Apart(body=left, arms=left),
+        replace(SHOWN, iterations=6, inner=40, bend=bend, root=root, lift=lift, stand=16.0, hold=2.0),
+    )
+    for left, bend, root, lift in ((0.07, 24000.0, 3.0, 10.0), (0.07, 60000.0, 0.3, 100.0), (0.1, 18000.0, 0.3, 10.0))
 )
 """How they are corrected, one after the other, while somebody is left deeper in another than so many metres: moved out
 of the way as a whole, smoothly, for who jumps is seen more than some centimetres of depth. The second moves people more
-readily than their limbs; the third, at once, keeps out who walks through somebody (docs/experiments_corrections.md,
-"Nobody is thrown")."""
+readily than their limbs, but not off the floor; the third, at once, keeps out who walks through somebody
+(docs/experiments_corrections.md, "Nobody is thrown")."""
 
 REMEMBERED = 60
 """Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in
