@@ -58,16 +58,11 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = tuple(
-    (
-        Apart(body=left, arms=left),
-        replace(SHOWN, iterations=6, inner=40, bend=bend, root=root, lift=lift, stand=16.0, hold=2.0),
-    )
-    for left, bend, root, lift in ((0.07, 24000.0, 3.0, 10.0), (0.07, 60000.0, 0.3, 100.0), (0.1, 18000.0, 0.3, 10.0))
+    replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=root, stand=16.0, hold=2.0) for root in (3.0, 0.3)
 )
-"""How they are corrected, one after the other, while somebody is left deeper in another than so many metres: moved out
-of the way as a whole, smoothly, for who jumps is seen more than some centimetres of depth. The second moves people more
-readily than their limbs, but not off the floor; the third, at once, keeps out who walks through somebody
-(docs/experiments_corrections.md, "Nobody is thrown")."""
+"""How they are corrected, one after the other, while somebody is left deep in another (`LEFT`): moved out of the way as
+a whole, smoothly, for a hand that jumps is seen more than some centimetres of depth. The second moves people readily,
+which shows at token borders, and keeps out who walks through somebody."""
 
 REMEMBERED = 60
 """Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in
@@ -76,8 +71,8 @@ CMU's salsa 9 are shorter."""
 REACH = 6
 """Frames before and after a moment that is corrected anew."""
 
-TOO_DEEP = Apart(body=0.08, arms=0.08)
-"""Metres of depth that `FINISHED` may leave."""
+LEFT, TOO_DEEP = Apart(body=0.07, arms=0.07), Apart(body=0.08, arms=0.08)
+"""Metres of depth that `SHOWN` may leave, and `FINISHED`."""
 
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
@@ -238,8 +233,8 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
-    for left, harder in PRESSED:
-        deep = left_deep(corrected(seen, offset), body, left, fixed).any(dim=1)
+    for harder in PRESSED:
+        deep = left_deep(corrected(seen, offset), body, LEFT, fixed).any(dim=1)
         if not bool(deep.any()):
             break
         before, hold = (None if each is None else each[deep] for each in (past, holding))

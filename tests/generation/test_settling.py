@@ -242,7 +242,6 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
 def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
     joints = load_body().joints(walked_on(1, speed))[0]
     assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08
-    assert float(900 * joints[:, 0, 0].diff(n=2, dim=0).norm(dim=-1).max()) < 80  # m/s2: nobody jumps aside
 
 
 def test_what_is_left_deep_in_a_finished_chunk_is_corrected_anew_and_nobody_is_thrown(monkeypatch) -> None:
