@@ -279,7 +279,7 @@ class Rollout:
                 self.first,
                 self.history,
                 self.body_guidance,
-                lambda stage: world.faint,
+                lambda _: world.faint,
             )
         self.reached = max(self.reached, stage.active[1])
         if world.causal and self.expected.most:
