@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.body import Body, load_body
 from magnet.checks import require_number
+from magnet.errors import warn_user
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, paths_of, person_file, save_bvh
 from magnet.export.cast import Style
@@ -205,17 +206,29 @@ def write(
         require_number("fps", fps, over=0, most=MOST_FPS)
     if apart or not kind.nan:
         require_finite(scene)
+        _warn_of_invalid(scene, path)
     rate = scene.fps if fps is None else fps
     if not kind.own_rate and abs(rate - scene.fps) > 1e-6:
         context_frames = round(context_frames * rate / scene.fps)
         scene = resampled(scene, rate)
     options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size, each)
-    places, make = places_of(path, scene.scenes, smplx), kind.write
-    if rigs:
-        make = functools.partial(_write_onto, rigs, RigOptions(joints=rig_joints))
+    places = places_of(path, scene.scenes, smplx)
+    make = functools.partial(_write_onto, rigs, RigOptions(joints=rig_joints)) if rigs else kind.write
     if len(places) == 1:
         return list(make(scene, path, options))
     return [made for b, place in enumerate(places) for made in make(scene.select([b]), place, options)]
+
+
+def _warn_of_invalid(scene: Scene, path: Path) -> None:
+    """Warn of frames that only our own scene files can mark, so that whoever reads the file takes them for motion."""
+    if scene.valid is None or not (bad := (~scene.valid).nonzero().tolist()):
+        return
+    (b, frame), of = bad[0], f"{scene.valid.numel()} frames"
+    first = f"frame {frame} of scene {b} first" if scene.scenes > 1 else f"frame {frame} first"
+    warn_user(
+        f"{path.name}: {len(bad)} of {of}, {first}, are marked as not valid (somebody not tracked, or made up); such a "
+        "file has no marks, and holds the scene's poses there like any motion; a .npz of the scene keeps them"
+    )
 
 
 def _write_onto(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from magnet.body import Body, load_body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import formats, reading, resampled
 from magnet.export.retarget import together
-from magnet.motion.scene import Scene, cat_agents
+from magnet.motion.scene import Scene, cat_agents, concatenate
 from magnet.testing import random_scene
 
 
@@ -220,3 +221,20 @@ def test_commands_name_files_of_more_people_from_before(
     formats.write(cat_agents([duet, duet]), tmp_path / "st.bvh")
     assert cli.main(["export", str(duet.save(tmp_path / "duet")), str(tmp_path / "st.bvh")]) == 0
     assert "st_person2.bvh, st_person3.bvh: lie beside" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "kind, options", [(".npz", {"smplx": True}), (".bvh", {}), (".csv", {}), (".glb", {}), (".html", {})]
+)
+def test_frames_that_are_not_valid_are_warned_of_once_where_a_file_cannot_mark_them(
+    kind: str, options: dict, duet: Scene, tmp_path: Path
+) -> None:
+    two = magnet.Motion.of(concatenate([duet, duet.replace(valid=torch.arange(12) < torch.tensor([[9]]))]))
+    said = f"^a{kind}: 3 of 24 frames, frame 9 of scene 1 first, are marked as not valid"
+    with pytest.warns(UserWarning, match=said) as caught:
+        two.save(tmp_path / f"a{kind}", **options)
+    assert len(caught) == 1 and caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        magnet.Motion.of(duet).save(tmp_path / f"b{kind}", **options)
+        formats.write(two.plain(), tmp_path / "c.npz")  # keeps the marks
