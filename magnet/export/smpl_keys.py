@@ -55,21 +55,24 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     whole = first_of(WHOLE, there)
     if whole is not None:
         return _axis_angle(where, held[whole])
-    parts = []
-    for keys, least, joints in ((ORIENT, 3, 1), (BODY, 3 * BODY_JOINTS - 3, None)):
+    found = []
+    for keys in (ORIENT, BODY):
         key = first_of(keys, there)
         if key is None:
             has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
             raise ValueError(f"{where}: lacks {' or '.join(keys[:2])}; it has {has}")
-        parts.append(_axis_angle(where, held[key], least, joints))
-    root, body = parts
+        found.append(held[key])
+    body = _axis_angle(where, found[1], 3 * BODY_JOINTS - 3)
+    if body.ndim == 2 and np.ndim(found[0]) == 3 and np.shape(found[0])[1:] == (3, 3):
+        found[0] = np.asarray(found[0])[:, None]  # a matrix a frame: of one person's body, not three frames of people
+    root = _axis_angle(where, found[0], 3, joints=1)
     if root.shape[-2] != body.shape[-2]:
         raise ValueError(
             f"{where}: unequal numbers of frames: root {root.shape[-2]}, body {body.shape[-2]}; expected one length"
         )
     if root.shape[:-1] != body.shape[:-1]:
         raise ValueError(f"{where}: root {root.shape} and body {body.shape} are of unequal numbers of people")
-    return np.concatenate(parts, axis=-1)
+    return np.concatenate([root, body], axis=-1)
 
 
 def _axis_angle(where: object, value: Any, least: int = 0, joints: int | None = None) -> Doubles:

@@ -237,7 +237,12 @@ def as_matrices(a: dict) -> dict:
             "betas": np.tile(a["betas"], (len(turned), 1))}  # fmt: skip
 
 
-@pytest.mark.parametrize("named", [as_amass, as_smplx, as_interx, as_aist, as_matrices])
+def as_root_matrix(a: dict) -> dict:
+    matrices = as_matrices(a)
+    return matrices | {"global_orient": matrices["global_orient"][:, 0], "body_pose": a["poses"][:, 3:66]}
+
+
+@pytest.mark.parametrize("named", [as_amass, as_smplx, as_interx, as_aist, as_matrices, as_root_matrix])
 def test_every_naming_that_training_reads_shows_the_same_motion(named, trio: Scene, body: Body, tmp_path) -> None:
     path = foreign(trio, body, tmp_path / "plain.npz", ())
     wanted = load_smplx(path, body)
