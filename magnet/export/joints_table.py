@@ -45,33 +45,18 @@ def read_table(path: str | Path) -> JointTable:
     """Read a table of joint positions: a row for each frame and person, three columns for each joint.
 
     Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`, `x_left_hip`), and by `frame`,
-    `person` and `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames in
-    order, of several people those of one time are one frame; without `time_s` the rate is not known. Cells may be
-    empty, and a joint at 0, 0, 0 is missing, too.
+    `person` and `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames by
+    their times, of several people those of one time are one frame; without `time_s`, too, they are frames in order, and
+    the rate is not known. Cells may be empty, and a joint at 0, 0, 0 is missing, too. Where frames or times tell of
+    frames without a row, all joints are missing in them.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: no text in UTF-8, no such columns, rows that are cut short, two rows of one frame and person, frames
-            that nothing tells, several scenes.
+            that nothing tells, too many frames, several scenes.
     """
     path = Path(path)
-    with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
-        first = file.readline()
-        if "\0" in first:
-            raise ValueError(f"{path}: is no text in UTF-8; save it again as CSV UTF-8")
-        said = said_sign(first)
-        above = int(said is not None)  # lines before the names
-        if not above:
-            file.seek(0)
-        sign = said or max(",;\t", key=first.count)
-        lines = csv.reader(file, delimiter=sign)
-        try:
-            numbered = [(lines.line_num + above, row) for row in lines if any(map(str.strip, row))]
-        except csv.Error as error:
-            raise ValueError(f"{path}, line {lines.line_num + above}: {error}; write it again as a table") from error
-    at_line, rows = [line for line, _ in numbered], [row for _, row in numbered]
-    if len(rows) < 2:
-        raise ValueError(f"{path}: holds no rows under a line of names")
+    sign, at_line, rows = _rows(path)
     head = [name.strip() for name in rows[0]]
     columns, unit = _columns(path, head)
     words = [name.lower() for name in head]
@@ -79,7 +64,11 @@ def read_table(path: str | Path) -> JointTable:
         next((words.index(name) for name in names if name in words), None)  # the surest name first
         for names in (FRAME, TIME, PERSON, ("scene",))
     )
-    numbers = np.array([[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in numbered[1:]])
+    if any(place is not None for place in (frame_at, time_at, person_at, scene_at)):  # else it is a frame of nobody
+        kept = [k for k, row in enumerate(rows) if any(map(str.strip, row))]
+        at_line, rows = [at_line[k] for k in kept], [rows[k] for k in kept]
+    told_in = zip(at_line[1:], rows[1:], strict=True)
+    numbers = np.array([[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in told_in])
     if scene_at is not None and len(scenes := {row[scene_at].strip() for row in rows[1:]}) > 1:
         raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
     told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
@@ -104,6 +93,31 @@ def read_table(path: str | Path) -> JointTable:
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
     fps = None if seconds is None else _rate(seconds, frame)
     return JointTable(tuple(columns), people, at, fps, unit, step)
+
+
+def _rows(path: Path) -> tuple[str, list[int], list[list[str]]]:
+    """The sign between cells, and the rows with their lines in the file, the names first; the last says something."""
+    with regular(path).open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        first = file.readline()
+        if "\0" in first:
+            raise ValueError(f"{path}: is no text in UTF-8; save it again as CSV UTF-8")
+        said = said_sign(first)
+        above = int(said is not None)  # lines before the names
+        if not above:
+            file.seek(0)
+        sign = said or max(",;\t", key=first.count)
+        lines = csv.reader(file, delimiter=sign)
+        try:
+            numbered = [(lines.line_num + above, row) for row in lines]
+        except csv.Error as error:
+            raise ValueError(f"{path}, line {lines.line_num + above}: {error}; write it again as a table") from error
+    says = [k for k, (_, row) in enumerate(numbered) if any(map(str.strip, row))]
+    if len(says) < 2:
+        raise ValueError(f"{path}: holds no rows under a line of names")
+    names, *below = numbered[says[0] : says[-1] + 1]
+    empty = [""] * len(names[1])
+    below = [(line, row if any(map(str.strip, row)) else empty) for line, row in below if row]
+    return sign, [names[0], *(line for line, _ in below)], [names[1], *(row for _, row in below)]
 
 
 def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str | None]:
@@ -144,8 +158,12 @@ def _frames(
 ) -> tuple[NDArray[np.int64], int]:
     """The frame of each row, from 0, and by how many the file counts on from one to the next."""
     if column is None:
-        if seconds is not None and len(set(told)) > 1 and np.isfinite(seconds).all():
-            return _by_time(seconds, told), 1
+        if seconds is not None and np.isfinite(seconds).all():
+            frame = _by_time(seconds, told)
+            if frame.max() >= LONGEST:
+                long = f"{np.ptp(seconds):.6g} seconds"
+                raise ValueError(f"{path}: times of {long}, more frames than are read ({LONGEST})")
+            return frame, 1
         count: dict[str, int] = {}
         frames = []
         for person in told:
@@ -169,13 +187,22 @@ def _frames(
 
 
 def _by_time(seconds: Floats, told: Sequence[str]) -> NDArray[np.int64]:
-    """The frames of several people's rows, of whom some may come later: rows of one time are of one frame."""
-    times = np.unique(seconds)
+    """The frames of rows by their times, of which some may be missing: of several people, rows of one time are of one.
+
+    The rows of one person are frames in order, so that times may be as coarse as whole seconds.
+    """
+    alone = len(set(told)) == 1
     own = [np.diff(np.sort(seconds[[who == person for who in told]])) for person in set(told)]
     steps = np.concatenate(own)
-    near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    new = np.concatenate([[0], np.cumsum(np.diff(times) > near)])
-    return np.asarray(new[np.searchsorted(times, seconds)], np.int64)
+    usual = float(np.quantile(steps[steps > 0], 0.5, method="lower")) if (steps > 0).any() else np.inf
+    step = float(steps[np.abs(steps - usual) < usual / 2].mean()) if np.isfinite(usual) else np.inf
+    times = seconds if alone else np.unique(seconds)
+    later = np.diff(times)
+    on = np.clip(np.floor(later / step + NEAR), 1, LONGEST)  # a frame late counts as a gap, half a frame does not
+    if not alone:
+        on[later <= (NEAR * usual if np.isfinite(usual) else 0.0)] = 0
+    frame = np.concatenate([[0], np.cumsum(on)])
+    return np.asarray(frame if alone else frame[np.searchsorted(times, seconds)], np.int64)
 
 
 def _seconds(said: Floats) -> Floats:

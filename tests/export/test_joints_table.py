@@ -124,3 +124,30 @@ def test_frames_that_are_counted_in_steps_are_the_files_frames(tmp_path: Path) -
         table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *(f"{t},{t / 50},1,2,3" for t in (10, 15, 25)))
     )
     assert found.step == 5 and found.at.shape[0] == 4 and found.fps == 10.0 and np.isnan(found.at[2]).all()
+
+
+@pytest.mark.parametrize("who", [",A", ""], ids=["a person is named", "nobody is"])
+@pytest.mark.parametrize("unit", [1.0, 1000.0], ids=["s", "ms"])
+def test_without_frames_times_tell_where_rows_are_missing(who: str, unit: float, tmp_path: Path) -> None:
+    rows = [f"{round(unit * t / 30, 0 if unit > 1 else 3)},{t + 1},0,0{who}" for t in range(90) if not 30 <= t < 60]
+    found = read_table(table(tmp_path / "a.csv", f"time,a_x,a_y,a_z{',person' if who else ''}", *rows))
+    there = np.isfinite(found.at[:, 0, 0, 0])
+    assert len(found.at) == 90 and found.fps == 30.0 and not there[30:60].any() and there.sum() == 60
+    assert (found.at[there, 0, 0, 0] == np.nonzero(there)[0] + 1).all()
+
+
+@pytest.mark.parametrize("late", [[0, 0, 0, 0, 0, 1], [0.0, 0.033, 0.066, 0.116, 0.149, 0.182]], ids=["coarse", "late"])
+def test_times_that_are_coarse_or_half_a_frame_late_have_no_gaps(late: list[float], tmp_path: Path) -> None:
+    found = read_table(table(tmp_path / "a.csv", "time,a_x,a_y,a_z", *(f"{time},1,2,3" for time in late)))
+    assert len(found.at) == 6 and np.isfinite(found.at).all()
+
+
+def test_times_far_apart_are_refused_rather_than_filled(tmp_path: Path) -> None:
+    rows = (f"{time},1,2,3" for time in (0, 0.04, 0.08, 86400))
+    with pytest.raises(ValueError, match=r"times of 86400 seconds, more frames than are read \(216000\)"):
+        read_table(table(tmp_path / "a.csv", "time,a_x,a_y,a_z", *rows))
+
+
+def test_a_row_without_anything_is_a_frame_without_anybody_where_rows_are_counted(tmp_path: Path) -> None:
+    found = read_table(table(tmp_path / "a.csv", "a_x,a_y,a_z", "1,2,3", ",,", "", "4,5,6", ",,", ""))
+    assert found.at.shape[0] == 3 and np.isnan(found.at[1]).all() and found.at[2, 0, 0].tolist() == [4, 5, 6]
