@@ -9,7 +9,7 @@ import torch
 
 from magnet.body import Body
 from magnet.export.npz import save_smplx
-from magnet.export.page.takes import same_length, take, takes
+from magnet.export.page.takes import numbered, same_length, take, takes
 from magnet.export.reading import Reading
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
@@ -24,6 +24,12 @@ def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path,
     assert found[0].known[:8].all()
     assert not found[0].known[8:].any()
     assert {each.label for each in found} == {"dance · 1", "dance · 2"}
+
+
+def test_labels_that_end_in_a_number_are_not_given_to_others(duet: Scene) -> None:
+    labels = ["a", "a", "a (1)", "b", "a"]
+    named = [each.label for each in numbered([take(label, duet) for label in labels])]
+    assert named[2:4] == ["a (1)", "b"] and len(set(named)) == 5 and all(name.startswith("a (") for name in named[:2])
 
 
 def test_a_part_of_a_file_is_shown(tmp_path: Path, duet: Scene, body: Body) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -114,7 +115,12 @@ def in_a_row(takes: Sequence[ShownTake]) -> list[Array]:
 def numbered(takes: list[ShownTake]) -> list[ShownTake]:
     """The takes with labels that differ, by which one is chosen."""
     labels = [each.label for each in takes]
-    return [
-        replace(each, label=f"{each.label} ({i + 1})" if labels.count(each.label) > 1 else each.label)
-        for i, each in enumerate(takes)
-    ]
+    used = {label for label in labels if labels.count(label) == 1}  # somebody's own label may end in a number, too
+    named = []
+    for i, each in enumerate(takes):
+        label = each.label
+        if labels.count(label) > 1:
+            label = next(new for k in itertools.count(i + 1) if (new := f"{each.label} ({k})") not in used)
+            used.add(label)
+        named.append(replace(each, label=label))
+    return named
