@@ -17,11 +17,9 @@ from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.scenery import Floor
-from magnet.viewer.server import start
+from magnet.viewer.server import TOLD, start
 from magnet.viewer.timeline import Timeline, Tracks
 
-TOLD = 15.0
-"""Seconds that an error message stays visible."""
 RATE = FPS
 """Largest number of frames sent per second."""
 SETTLES = 0.3

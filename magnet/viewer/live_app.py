@@ -20,7 +20,7 @@ from magnet.viewer.clock import Clock
 from magnet.viewer.handles import KeyframePanel, Steering
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.timeline import Tracks
-from magnet.viewer.worker import Worker
+from magnet.viewer.worker import Worker, said
 
 GUIDE = """\
 **Watch.** The model generates about a second ahead of what you see, as long as this page is open. Drag the mouse to
@@ -224,17 +224,11 @@ class LiveApp(ViewerBase):
 
         def begin(_: Any) -> None:
             anew.disabled, self.worker.paused = True, True
-            try:
-                self.steering.nobody()
-                self.keys.clear()
-                start = None if example.value == NOTHING else Scene.load(self.examples[example.value])
-                self.live.begin(int(number.value), start)
-                with self.lock:
-                    self.again = 0
-                    self.clock.play(True)
-            finally:
-                anew.disabled = False
-                apply()
+            refusal = self._begun(example.value, int(number.value))
+            anew.disabled = False
+            apply()
+            if refusal:
+                self._refused(refusal)
 
         def restart(_: Any) -> None:
             self.live.restart(self.clock.frame)
@@ -259,6 +253,20 @@ class LiveApp(ViewerBase):
         again.on_click(restart)
         self.apply, self.task, self.running = apply, task, running
         apply()
+
+    def _begun(self, example: str, people: int) -> str:
+        """Begin anew. -> why not, as the worker would say it: the scene stays as it is then"""
+        try:
+            start = None if example == NOTHING else Scene.load(self.examples[example])
+            self.steering.nobody()
+            self.keys.clear()
+            self.live.begin(people, start)
+            with self.lock:
+                self.again = 0
+                self.clock.play(True)
+        except Exception as error:
+            return said(error)
+        return ""
 
     def set_loop(self, on: bool) -> None:
         """Loop over what has been generated, with the model paused, or continue generating."""

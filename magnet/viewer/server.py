@@ -6,11 +6,12 @@ import asyncio
 import contextlib
 import http
 import ipaddress
+import math
 import os
 import socket
 import sys
 from collections.abc import AsyncIterator, Iterator
-from typing import Any
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 AT_ONCE = "Object.defineProperty(document, 'hidden', {configurable: true, get: () => true})"
@@ -22,6 +23,10 @@ where no GPU draws, bodies were ahead of their colours and marks by a tenth of a
 """
 GRACE = 0.5
 """Seconds that browsers have to say goodbye when a server stops: one whose connection is cut never does."""
+TOLD = 15.0
+"""Seconds that an error message stays visible."""
+LONG = 60
+"""Letters of a wrong value that are repeated."""
 NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
@@ -45,6 +50,7 @@ def start(host: str, port: int, title: str) -> Any:
         server.stop()
         raise OSError(taken(host, port))
     server.gui.add_html(TOGETHER)
+    only_values_of_pages(server)
     return server
 
 
@@ -110,6 +116,47 @@ def own_pages_only(local: bool) -> Iterator[None]:
         sockets.serve = serve  # type: ignore[misc]
     if not guarded:
         raise ImportError('this viser would answer pages of other servers, too: pip install "viser==1.1.1"')
+
+
+def only_values_of_pages(server: Any) -> None:
+    """Let pages set controls to nothing but what these offer: viser takes what comes, and prints what then fails.
+
+    A viser that is not built like version 1.1 is left as it is.
+    """
+    try:
+        from viser._messages import GuiUpdateMessage
+
+        gui = server.gui
+        take, controls = gui._handle_gui_updates, gui._gui_input_handle_from_uuid
+        gui._websock_interface.unregister_handler(GuiUpdateMessage, take)
+    except (ImportError, AttributeError, AssertionError, KeyError, ValueError):
+        return
+
+    async def heard(client_id: int, message: Any) -> None:
+        control = controls.get(message.uuid)
+        asked = control is not None and "value" in message.updates
+        said = not_offered(control, message.updates["value"]) if asked else ""
+        if not said:
+            await take(client_id, message)
+        elif client := server.get_clients().get(client_id):
+            client.add_notification("Not set", said, color="red", auto_close_seconds=TOLD)
+
+    gui._websock_interface.register_handler(GuiUpdateMessage, heard)
+
+
+def not_offered(control: Any, value: object) -> str:
+    """What is wrong with a value that a page sends for one of its controls; empty if nothing is."""
+    options, now = getattr(control, "options", None), control.value
+    if options is not None:
+        fits, expected = value in tuple(options), ", ".join(map(str, options))
+    elif isinstance(now, bool):
+        fits, expected = isinstance(value, bool), "on or off"
+    elif isinstance(now, int | float):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        fits, expected = number and math.isfinite(cast(float, value)), "a number"
+    else:
+        return ""
+    return "" if fits else f"{getattr(control, 'label', 'a control')}: got {repr(value)[:LONG]}, expected {expected}"
 
 
 def require_viser() -> Any:

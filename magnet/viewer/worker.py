@@ -66,6 +66,11 @@ class Worker:
                     self.done(chunk)
             except Exception as error:  # whatever a task or its options raise: the page says so, and goes on
                 if self.failed is not None:
-                    self.failed(str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}")
+                    self.failed(said(error))
                 self._wake.clear()
                 self._wake.wait(timeout=2.0)
+
+
+def said(error: Exception) -> str:
+    """What a page says of an error: our own words, or those of others with the error's name."""
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"

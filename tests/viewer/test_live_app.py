@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -67,3 +70,64 @@ def test_what_is_drawn_while_a_scene_begins_anew_is_the_old_one_or_the_new_one(a
     assert not failed
     assert len(app.views[0].take.slots) == 3 and app.version == live.version
     assert app.clock.frames == live.scene.frames
+
+
+@pytest.fixture
+def controls(app: Any) -> dict[str, Any]:
+    """Those of the page, by their labels."""
+    return {each.label: each for each in app.server.gui._gui_input_handle_from_uuid.values() if hasattr(each, "label")}
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "said"),
+    [
+        ("task", "juggling", "task: got 'juggling', expected "),
+        ("task", ["joint_future"], "task: got ['joint_future'], expected "),
+        ("whom", {"a": 1}, "whom: got {'a': 1}, expected nobody, person 1, "),
+        ("step", "far", "step: got 'far', expected |<, "),
+        ("people", None, "people: got None, expected "),
+        ("example", 7, "example: got 7, expected from nothing"),
+        ("weight", "much", "weight: got 'much', expected a number"),
+        ("weight", float("nan"), "weight: got nan, expected a number"),
+        ("at frame", [1] * 100, "at frame: got [1, 1, "),
+        ("loop", "yes", "loop: got 'yes', expected on or off"),
+    ],
+)
+def test_what_no_page_sends_is_refused_and_changes_nothing(
+    label: str, value: object, said: str, app: Any, controls: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from viser._messages import GuiUpdateMessage
+
+    told: list[str] = []
+    client = SimpleNamespace(add_notification=lambda title, text, **_: told.append(f"{title}: {text}"))
+    monkeypatch.setattr(app.server, "get_clients", lambda: {7: client})
+    before = controls[label].value
+    message = GuiUpdateMessage(controls[label]._impl.uuid, {"value": value})
+    asyncio.run(app.server._websock_server._handle_incoming_message(7, message))
+    assert len(told) == 1 and told[0].startswith(f"Not set: {said}") and controls[label].value == before
+
+
+def test_what_a_page_sends_is_taken(app: Any, controls: dict[str, Any]) -> None:
+    from viser._messages import GuiUpdateMessage
+
+    for label, value in (("task", "inbetweening"), ("weight", 2), ("loop", True), ("step", "+10")):
+        message = GuiUpdateMessage(controls[label]._impl.uuid, {"value": value})
+        asyncio.run(app.server._websock_server._handle_incoming_message(7, message))
+        assert controls[label].value == value
+
+
+def test_the_page_says_why_a_scene_does_not_begin(app: Any, controls: dict[str, Any], tmp_path: Path) -> None:
+    app.worker.stop()
+    app.examples["gone"] = tmp_path / "gone.npz"
+    (tmp_path / "gone.npz").write_bytes(b"words")
+    controls["example"].options = (*controls["example"].options, "gone")
+    controls["example"]._impl.value = "gone"
+    before = app.live.version
+    for pressed in controls["Start anew"]._impl.update_cb:
+        pressed(SimpleNamespace(client_id=7))
+    assert "gone.npz: not a scene file" in app.caption(0) and app.live.version == before
+    assert not controls["Start anew"].disabled
+    (tmp_path / "gone.npz").unlink()
+    for pressed in controls["Start anew"]._impl.update_cb:
+        pressed(SimpleNamespace(client_id=7))
+    assert "FileNotFoundError: " in app.caption(0)
