@@ -15,7 +15,7 @@ from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_agents, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
-from magnet.sampling.options import SamplerOptions
+from magnet.sampling.options import LEAST_SPACING, MOST_SPACING, SamplerOptions
 from magnet.tasks.joint import Generation
 
 MOST = 200
@@ -47,14 +47,14 @@ def start_crowd(
         people: how many in all.
         options: how couples are sampled.
         generator: source of randomness, on the model's device.
-        groups, spacing: as for `compose`.
+        groups, spacing: as for `compose`; couples that the model makes need `LEAST_SPACING` metres.
         betas: (people, 10) shapes of people whom the model makes; None: by chance.
 
     Returns:
         One scene of `people`; of `START` frames where the model makes it.
 
     Raises:
-        ValueError: nobody, or more people than `MOST`.
+        ValueError: nobody, more people than `MOST`, or couples so near that people begin in each other's bodies.
     """
     require_whole("people", people, 1, MOST)
     model = denoiser_of(model)
@@ -62,6 +62,7 @@ def start_crowd(
     turns = torch.Generator()
     turns.manual_seed(int(torch.randint(2**62, (), generator=generator, device=model.device)))
     if not groups:
+        require_number("spacing", spacing, least=LEAST_SPACING, most=MOST_SPACING)
         couples = -(-people // 2)
         empty = empty_scene(couples, TOKEN_FRAMES, 2, torch.zeros((), dtype=torch.float32))
         shapes = shapes_by_chance(2 * couples, turns)

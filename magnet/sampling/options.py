@@ -34,8 +34,9 @@ def require_spacing(spacing: str, shift: float) -> None:
 
 MOST_WEIGHT, MOST_BLEND = 1e6, 1_000_000
 """Of a pairwise transform and frames of a blend: beyond, numbers overflow."""
-MOST_SPACING = 1000.0
-"""Metres between the couples of a crowd: much farther from the middle float32 moves people in steps of millimetres."""
+LEAST_SPACING, MOST_SPACING = 1.5, 1000.0
+"""Metres between the couples of a crowd. Nearer, people begin in strangers' bodies (docs/crowds.md has how many); much
+farther from the middle float32 moves people in steps of millimetres."""
 LEAST_TOGETHER = 0.3
 """Metres between two pelvises within which no couple can be held: bodies are as wide."""
 
@@ -95,7 +96,7 @@ class SamplerOptions:
         crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
             beyond which a partner stops being one. With 2.5 and 3.5 m strangers crowd together, because the models
             learned from couples (docs/crowds.md).
-        crowd_spacing: metres between the couples with which a crowd from nothing begins.
+        crowd_spacing: metres between the couples with which a crowd from nothing begins, at least 1.5.
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.
         noise_sampling: `joint`: agents at a time step share one level; `independent`: each token of each agent has
@@ -165,7 +166,7 @@ class SamplerOptions:
         require_whole("blend", self.blend, 0, MOST_BLEND)
         require_number("crowd_enter", self.crowd_enter, over=0)
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
-        require_number("crowd_spacing", self.crowd_spacing, over=0, most=MOST_SPACING)
+        require_number("crowd_spacing", self.crowd_spacing, least=LEAST_SPACING, most=MOST_SPACING)
         require_number("eta", self.eta, 0, 1)
         if self.together is not None:
             require_number("together", self.together, least=0)

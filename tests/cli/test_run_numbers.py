@@ -83,7 +83,8 @@ def test_devices_that_can_be_are_taken_and_others_are_not() -> None:
     ("field", "value", "message"),
     [
         ("pyramid_offset", 9999, "got 9999, expected 0 to 1000"),
-        ("crowd_spacing", 1e30, "over 0 and at most 1000"),
+        ("crowd_spacing", 1e30, "1.5 to 1000"),
+        ("crowd_spacing", 1.4, "got 1.4, expected 1.5 to 1000"),
         ("together", 1e-60, "got 1e-60, expected metres of at least 0.3, or 0"),
     ],
 )

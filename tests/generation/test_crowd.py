@@ -279,6 +279,8 @@ def test_a_crowd_that_the_model_begins_is_of_different_people(model: Denoiser) -
     assert (scene.scenes, scene.frames, scene.agents) == (1, 32, 7)
     assert len(scene.betas[0].unique(dim=0)) == 7
     assert torch.equal(scene.T_world_root, start_crowd(model, 7, QUICK, seeded()).T_world_root)
+    with pytest.raises(ValueError, match=r"spacing: got 1, expected 1\.5 to 1000"):
+        start_crowd(model, 7, QUICK, seeded(), spacing=1.0)
 
 
 def test_each_sample_of_a_crowd_from_nothing_begins_anew_and_nothing_was_given(model: Denoiser) -> None:
