@@ -30,12 +30,12 @@ def held(folder: Path) -> Iterator[None]:
         return
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     with contextlib.ExitStack() as lock:
-        # Called last of all: the lock's file goes once it is let go, and folders that nothing came into.
-        lock.callback(_leave, folder, made)
+        lock.callback(_leave, made)  # called last of all
         with contextlib.suppress(OSError, NotImplementedError):
             folder.mkdir(parents=True, exist_ok=True)
             try:
                 lock.enter_context(alone(folder / LOCK, ""))
+                lock.callback(_remove, folder / LOCK)
             except Taken as error:
                 lock.pop_all()
                 raise CommandError(
@@ -44,9 +44,18 @@ def held(folder: Path) -> Iterator[None]:
         yield
 
 
-def _leave(folder: Path, made: list[Path]) -> None:
-    with contextlib.suppress(OSError):  # another training may hold it by now
-        (folder / LOCK).unlink()
+def _remove(lock: Path) -> None:
+    """Remove a lock's file while it is held, for once it is let go, another training may hold that very file.
+
+    One that has opened it by now is not let in by a file without a name: filelock looks (3.29.5 and later, which
+    remove no file of others either).
+    """
+    with contextlib.suppress(OSError):  # on Windows filelock removes it as it lets go
+        lock.unlink()
+
+
+def _leave(made: list[Path]) -> None:
+    """Remove folders that nothing came into."""
     for each in made:
         with contextlib.suppress(OSError):
             each.rmdir()

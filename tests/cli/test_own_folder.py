@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from magnet import cli
 from magnet.cli import own_folder
-from magnet.files import alone
+from magnet.files import Taken, alone
 from tests.toys import ToyModel
 
 FIT = ["fit", "--model", "ToyModel", "--data", "ToyData", "--trainer.max_steps", "1", "--out", "two"]
@@ -59,6 +62,38 @@ def test_the_lock_is_held_while_training_and_by_the_first_process_alone(
     with own_folder.held(toy / "never" / "began"):
         assert (toy / "never" / "began").is_dir()
     assert not (toy / "never").exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows removes no file that is open")
+def test_the_locks_file_goes_while_the_lock_is_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Removed later, it may be one that another training holds by then, beside which a third one would be let in."""
+    seen = []
+
+    @contextlib.contextmanager
+    def watched(lock: Path, taken: str) -> Iterator[None]:
+        with alone(lock, taken):
+            yield
+            seen.append(lock.exists())
+
+    monkeypatch.setattr(own_folder, "alone", watched)
+    with own_folder.held(tmp_path / "two"):
+        assert (tmp_path / "two" / own_folder.LOCK).exists()
+    assert seen == [False] and not (tmp_path / "two").exists()
+
+
+def test_a_lock_whose_file_is_removed_meanwhile_is_not_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its last holder removed it between this process's opening it and locking it."""
+    fcntl = pytest.importorskip("fcntl")
+    flock, lock = fcntl.flock, tmp_path / own_folder.LOCK
+
+    def late(fd: int, how: int) -> None:
+        if how & fcntl.LOCK_EX:
+            lock.unlink(missing_ok=True)
+        flock(fd, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with pytest.raises(Taken, match="taken"), alone(lock, "taken"):
+        pass
 
 
 def test_a_training_runs_without_a_lock_where_there_are_none(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
