@@ -77,8 +77,9 @@ BASELINE_COMPOSED = 500
 WINDOW_STRIDE = 5
 """Frames between the training windows that the regression is fitted to and the nearest one is looked for among."""
 
-MAX_WINDOWS = 1500
-"""About so many of them, mirror images not counted; with more data their stride grows, to `baseline_stride` at most."""
+ENOUGH_WINDOWS = 1500
+"""About so many of them are enough, mirror images not counted: with more data their stride grows, though to
+`baseline_stride` at most, so that of much data there are more."""
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""
@@ -202,7 +203,7 @@ class Scoring:
 
     def _training_windows(self, datamodule: MotionDataModule) -> Windows:
         frames = self.context + self.horizon
-        stride = max(WINDOW_STRIDE, int(datamodule.store("train").length.sum()) // MAX_WINDOWS)
+        stride = max(WINDOW_STRIDE, int(datamodule.store("train").length.sum()) // ENOUGH_WINDOWS)
         composed = BASELINE_COMPOSED if datamodule.test.composed else 0
         scenes = datamodule.train_windows(frames, min(stride, self.baseline_stride), composed)
         mirror = datamodule.augment.mirror
