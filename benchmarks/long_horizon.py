@@ -219,7 +219,10 @@ def options() -> argparse.Namespace:
     )
     parser.add_argument("--noise_scale", type=float, help="of new noise in denoising; default: the model's")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="fp32")
-    return parser.parse_args()
+    given = parser.parse_args()
+    if given.frames < WINDOW:
+        parser.error(f"--frames {given.frames}: expected {WINDOW} or more, the five seconds that each number is of")
+    return given
 
 
 def main() -> None:
