@@ -22,7 +22,7 @@ from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP
 from magnet.export.rig_motion import Bools, Floats
 from magnet.export.upright import WARNING
 from magnet.motion.rotations import about_y
-from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.motion.scene import BODY_JOINTS, FPS, Scene
 
 OURS = "our own names"
 LOW = 0.05
@@ -50,7 +50,7 @@ def load_joints(
 
     Args:
         unit, up, joints: as `magnet.export.reading.Reading` has them; up is found from where torsos point.
-        fps: the table's frames a second, or of its count of frames, if it says no time.
+        fps: the table's frames a second, or of its count of frames, if it says no time; of one frame `FPS`, too.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
 
     Raises:
@@ -61,6 +61,8 @@ def load_joints(
     rate = table.fps or (fps and fps / table.step)
     if table.fps:
         require_own_rate(path, table.fps * table.step, fps)
+    if single := rate is None and len(table.at) == 1:
+        rate = FPS
     if rate is None:
         raise ValueError(f"{path}: says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
     if up is not None and up not in UP:
@@ -81,6 +83,8 @@ def load_joints(
     head = f"{path.name}: joint positions, {scheme}, {len(used)} joints; unit {name}, {up} up, {rate:g} fps"
     if table.step > 1:
         doubts = [f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second", *doubts]
+    if single:
+        doubts = [f"  it has one frame and so no rate: {rate:g} frames a second, unless --in_fps says others", *doubts]
     notes = [head, f"  the body's joints lie {100 * off:.1f} cm from the file's on average", *notes, *doubts]
     if off > POOR_FIT:
         notes.append("  that is much: its proportions are far from a person's; hands and feet may miss")

@@ -112,6 +112,19 @@ def test_a_table_without_a_time_asks_for_the_rate_and_a_file_a_person_is_one_sce
     assert got.fps == 60 and off(got, salsa, body) < 0.02
 
 
+@pytest.mark.parametrize("without", ["time", ""])
+def test_one_frame_needs_no_rate(without: str, salsa: Scene, body: Body, tmp_path: Path) -> None:
+    path = tracked(salsa.slice(8, 9), body, tmp_path / "a.csv")
+    if without:
+        rows = [line.split(",") for line in path.read_text().splitlines()]
+        path.write_text("\n".join(",".join([row[0], *row[2:]]) for row in rows) + "\n")
+    got = read(path, options=Reading(keep_floor=True))
+    assert got.scene.fps == 30 and got.scene.frames == 1 and off(got.scene, salsa.slice(8, 9), body) < 0.1
+    assert "it has one frame and so no rate: 30 frames a second, unless --in_fps says others" in got.notes[0]
+    told = read(path, options=Reading(in_fps=60, fps=None))
+    assert told.scene.fps == 60 and "no rate" not in told.notes[0]
+
+
 def test_another_rate_than_that_of_the_times_is_refused(salsa: Scene, body: Body, tmp_path: Path) -> None:
     path = tracked(salsa, body, tmp_path / "a.csv")
     assert read(path, options=Reading(in_fps=30)).scene.fps == 30
