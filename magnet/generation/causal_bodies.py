@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field, require_finite
+from magnet.generation.expected import of_itself
 from magnet.generation.settling import PACE, Corrected, settled_on
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
@@ -20,8 +21,9 @@ from magnet.sampling.schedule import Stage
 from magnet.tokenizer.carried import Carried
 from magnet.tokenizer.lean import Growing, decoded
 
-EXPECTED = 1
-"""Token steps after a block, as they are expected, that its corrections must be able to go on to."""
+EXPECTED = 2
+"""Token steps after a block, as they are expected, that its corrections must be able to go on to
+(docs/experiments_corrections.md, "Others as they are expected")."""
 
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
@@ -47,64 +49,12 @@ class World(Protocol):
     there: Tensor
     released: int
     decoder: Carried
+    decoder_of_others: dict[int, Carried]
 
     @property
     def settle(self) -> str | None: ...
 
     def rows_by_frame(self, rows: Tensor) -> Tensor: ...
-
-
-class Expected:
-    """The tokens that the model predicts after a block, for the decoder to look ahead at.
-
-    A decoder that looks ahead gives poses that slide and jerk where nothing follows the newest token. The prediction
-    costs nothing: the last denoising step makes it, in each agent's own view, for the token steps `ahead` of the
-    window.
-
-    Args:
-        most: tokens that the decoder looks ahead.
-    """
-
-    def __init__(self, most: int) -> None:
-        self.most = most
-        self.row = -1
-        self._tokens: Tensor | None = None
-        self._told = torch.zeros(0, dtype=torch.bool)
-
-    def keep(self, stage: Stage, clean: Tensor) -> None:
-        """Keep what a stage predicts after its block. clean (B, W + ahead, P, D)
-
-        Of each agent the first prediction is kept: later stages of the same block see more than it may.
-        """
-        row = stage.active[1]
-        behind = clean[:, row - stage.start :][:, : self.most]
-        if row != self.row:
-            self.row, self._tokens = row, behind.clone()
-            self._told = torch.zeros(clean.shape[2], dtype=torch.bool)
-        new = (stage.levels[-1, row - 1 - stage.start] == 0) & ~self._told
-        if self._tokens is not None and self._tokens.shape == behind.shape:
-            self._tokens[:, :, new] = behind[:, :, new]
-            self._told |= new
-
-    def behind(self, row: int) -> tuple[Tensor, Tensor] | None:
-        """Tokens (B, n, P, D) predicted from a token step on, and for whom (P,) bool; None: there are none."""
-        if row != self.row or self._tokens is None or not self._tokens.shape[1] or not bool(self._told.any()):
-            return None
-        return self._tokens, self._told
-
-
-def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
-    """Each agent's prediction in its own view, without guidance. (B V K, W, P, D) -> (B, W, P, D)
-
-    A step's views and the branches of guidance run as one batch, scenes first, then views; the first branch is the
-    unguided one.
-    """
-    if stage.visibility is None:
-        return clean.unflatten(0, (scenes, -1))[:, 0]
-    views, view_of = (~stage.visibility).unique(dim=0, return_inverse=True)
-    each = clean.unflatten(0, (scenes, len(views), -1))[:, :, 0]  # (B, V, W, P, D)
-    agent = torch.arange(clean.shape[2])
-    return each[:, view_of, :, agent].permute(1, 2, 0, 3)
 
 
 @torch.inference_mode()
@@ -116,37 +66,78 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
         tokens: (B, N, P, D), of which those up to `near` are read.
         stop: one past the last token step to finalize.
         near: one past the last finished token step, at least `stop`.
-        expected: see `Expected.behind`, from `near` on.
+        expected: what is expected from `near` on, see `magnet.generation.expected`.
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-    told = None if expected is None else expected[1]
-    more = EXPECTED if world.settle is not None and (near > stop or told is not None) else 0
+    behind = near - stop + (0 if expected is None else expected[0].shape[2])
+    more = 0 if world.settle is None else min(EXPECTED, behind)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected, more)
     if world.settle is not None:
-        made = _settled(world, made, stop, world.settle, None if near > stop else told)
+        made = _settled(world, made, stop, world.settle, tokens, None if near > stop else expected)
     world.given.body_rot[:, frames] = made.body_rot
     world.given.T_world_root[:, frames] = made.T_world_root
     world.finalized = stop
 
 
-def _settled(world: World, made: Scene, stop: int, how: str, told: Tensor | None) -> Scene:
+def _settled(
+    world: World, made: Scene, stop: int, how: str, tokens: Tensor, expected: tuple[Tensor, Tensor] | None
+) -> Scene:
     """Bodies of the token steps up to `stop` corrected, each person's by what was final of others before, or shown.
 
-    Frames of `made` after them are what the corrections will have to go on to; they are not returned. told (P,) bool,
-    whose they are; None: everybody's.
+    Frames of `made` after them are what the corrections will have to go on to; they are not returned. They are those of
+    who is `expected` to do something; None: everybody's.
     """
     first, own = world.finalized * TOKEN_FRAMES, (stop - world.finalized) * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
     new = world.rows_by_frame(world.placed[rows] & ~world.known[rows])
-    after = new[-1:] if told is None else new[-1:] & told.to(new.device)
+    after = new[-1:] if expected is None else new[-1:] & expected[1].to(new.device)
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     seen = 1 + PACE if world.correction is not None else RECALLED
     before = world.given.slice(max(first - seen, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     sees = (world.saw & world.placed[rows].all(dim=0)).to(new.device)
-    made, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected)
+
+    def later(one: int, others: Tensor, shown: Scene) -> Scene | None:
+        if expected is None or not bool(expected[1][one]):
+            return None
+        after = made.frames // TOKEN_FRAMES - (stop - world.finalized)
+        return others_expected(world, tokens, stop, after, expected[0][:, one], one, others, shown)
+
+    corrected, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected, later)
     world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
-    return made.slice(0, own)
+    return corrected.slice(0, own)
+
+
+def others_expected(
+    world: World, tokens: Tensor, stop: int, after: int, expected: Tensor, one: int, others: Tensor, shown: Scene
+) -> Scene:
+    """Frames after a block as somebody expects others to go on in them from where they are. -> (B, 4 after, P)
+
+    Args:
+        world: in which the tokens up to `stop` are placed.
+        tokens: (B, N, P, D), of which those up to `stop` are read.
+        stop: one past the block's last token step.
+        after: token steps after it, at most n.
+        expected: (B, n, P, D) the tokens of everybody from `stop` on that are expected.
+        one: who expects them.
+        others: (p,) int, of whom something is wanted; frames of the rest mean nothing.
+        shown: (B, LEAD, P) the last frames of the block.
+    """
+    model, low = world.model, max(stop - receptive_field(world.model)[0], 0)
+    latent, deltas, _ = model.parts_of(tokens[:, low:stop])
+    later, ways, _ = model.parts_of(expected)
+    ways = to_9d(project_se2(from_9d(ways)))
+    frames = slice(stop * TOKEN_FRAMES - LEAD, (stop + after) * TOKEN_FRAMES)
+    wanted = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
+    parts = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
+    carried = world.decoder_of_others.setdefault(one, Carried(world.decoder.keep))
+    features = decoded_frames(world, *parts, wanted, low, stop - low, others, carried)
+    # Not averaged: of who is given and who is made alike, so that agents by themselves expect what one process does.
+    T_world_can = path_on(world.T_world_can[:, : stop * TOKEN_FRAMES], ways, frames.stop)[:, frames]
+    given = shown.frames_at(torch.arange(frames.stop - frames.start).clamp(max=LEAD - 1))
+    keep = torch.arange(given.frames)[:, None].expand(-1, given.agents) < LEAD
+    made = posed(features, T_world_can, given)
+    return spring_from_given(made, given, T_world_can, keep.to(made.device), world.options.blend).slice(LEAD)
 
 
 def shown(world: World, stage: Stage) -> Tensor:
@@ -224,21 +215,33 @@ def path_with_expected(world: World, near: int, ways: Tensor | None, stop: int) 
     The last of them is averaged with where the first of `ways` (B, n, P, 4, 9) leads: what is expected next.
     """
     frames = max(near, stop) * TOKEN_FRAMES
-    T_world_can = world.T_world_can[:, : near * TOKEN_FRAMES]
-    placed, known = (world.rows_by_frame(each[:near]) for each in (world.placed, world.known))
-    if ways is not None:
-        steps = from_9d(ways.transpose(2, 3).flatten(1, 2)[:, : frames + 1 - len(placed)])  # (B, f, P, 4, 4)
-        for step in steps.unbind(dim=1):
-            T_world_can = torch.cat([T_world_can, T_world_can[:, -1:] @ step[:, None]], dim=1)
+    T_world_can = path_on(world.T_world_can[:, : near * TOKEN_FRAMES], ways, frames + 1)
+    if world.options.smooth_path:
+        placed, known = (world.rows_by_frame(each[:near]) for each in (world.placed, world.known))
         behind = T_world_can.shape[1] - len(placed)
         placed, known = (torch.cat([each, each[-1:].expand(behind, -1)]) for each in (placed, known))
-    if world.options.smooth_path:
         T_world_can = smoothed_path(T_world_can, placed, known)
     return T_world_can[:, :frames]
 
 
+def path_on(T_world_can: Tensor, ways: Tensor | None, frames: int) -> Tensor:
+    """A path (B, T, P, 4, 4) and, up to so many frames, where `ways` (B, n, P, 4, 9) lead on from its end."""
+    if ways is not None:
+        steps = from_9d(ways.transpose(2, 3).flatten(1, 2)[:, : frames - T_world_can.shape[1]])  # (B, f, P, 4, 4)
+        for step in steps.unbind(dim=1):
+            T_world_can = torch.cat([T_world_can, T_world_can[:, -1:] @ step[:, None]], dim=1)
+    return T_world_can
+
+
 def decoded_frames(
-    world: World, latent: Tensor, deltas: Tensor, frames: slice, low: int, final: int, there: Tensor | None = None
+    world: World,
+    latent: Tensor,
+    deltas: Tensor,
+    frames: slice,
+    low: int,
+    final: int,
+    there: Tensor | None = None,
+    carried: Carried | None = None,
 ) -> Tensor:
     """Some frames of decoded tokens, of those who are `there`. (B, n, P, C), (B, n, P, 4, 9) -> (B, f, P, 135)
 
@@ -248,7 +251,7 @@ def decoded_frames(
     if world.options.precision == "reference":
         return tokenizer.decode(latent, betas, deltas)[:, frames]
     there = world.there if there is None else there
-    growing = Growing(world.decoder, world.released + low, final)
+    growing = Growing(carried or world.decoder, world.released + low, final)
     made = (
         latent.new_zeros(len(latent), frames.stop - frames.start, 0, POSE_FEATURES)
         if not len(there)
@@ -264,8 +267,7 @@ def continuation(
     world: World, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
-    tokens, told = expected
-    told = told.to(latent.device)
+    tokens, told = of_itself(expected[0]), expected[1].to(latent.device)
     later, ways, _ = world.model.parts_of(tokens)
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])

@@ -16,7 +16,7 @@ from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import without_dropout
 from magnet.generation.body_guidance import BodyGuidance
-from magnet.generation.causal_bodies import Expected, finalize_bodies, own_view, shown
+from magnet.generation.causal_bodies import finalize_bodies, shown
 from magnet.generation.conditioning import (
     Encoders,
     known_tokens,
@@ -26,6 +26,7 @@ from magnet.generation.conditioning import (
     require_people,
     task_lookahead_limit,
 )
+from magnet.generation.expected import Expected, views
 from magnet.generation.inputs import check_condition, check_given, check_request, whole_tokens
 from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.plan import periodic_plan, planned
@@ -283,7 +284,7 @@ class Rollout:
             )
         self.reached = max(self.reached, stage.active[1])
         if world.causal and self.expected.most:
-            self.expected.keep(stage, own_view(self._clean, stage, len(self.tokens)))
+            self.expected.keep(stage, *views(self._clean, stage, len(self.tokens)))
 
     def _ask_for(self, stage: Stage) -> None:
         """Note whose predictions are read: tokens that the stage changes and, in its last step, those behind them."""
@@ -320,7 +321,7 @@ class Rollout:
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
         self._steps_left -= 1
-        if self._steps_left == 0 and self.expected.most:  # what is expected next is kept, see `Expected`
+        if self._steps_left == 0 and self.expected.most:  # it is kept
             self._asked[len(self._asked) - self._ahead :] = True
         if self._ahead:  # nobody's: shown as the mean of pure noise, which tells nothing of anybody
             noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
@@ -334,8 +335,7 @@ class Rollout:
 
     def _condition(self, batch: int, width: int) -> Tensor | None:
         """The condition of a window, for all views and branches of guidance of each scene."""
-        cond = self.cond
-        if cond is None:
+        if (cond := self.cond) is None:
             return None
         if cond.ndim == 3:
             cond = cond[:, self.begins : self.begins + width]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from magnet.body.apart import Apart, excess_depth
 from magnet.body.holding import holds, lasting_holds
 from magnet.body.indices import pairs_of
 from magnet.body.repair import STUBBORN, repaired, settling
-from magnet.body.settle import DOFS, Settle, corrected
+from magnet.body.settle import DOFS, LEAD, Settle, corrected
 from magnet.generation.separation import Decode, open_body_on
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene, cat_time
@@ -159,6 +160,11 @@ def settled_block(
     return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
+Later = Callable[[int, Tensor, Scene], Scene | None]
+"""The frames after a block as somebody, by number, expects others (p,) int to go on from its last frames (B, LEAD, P);
+None: nothing is expected."""
+
+
 class Corrected(NamedTuple):
     """How the last frames of a chunk or block were corrected, for the next one.
 
@@ -271,6 +277,7 @@ def settled_on(
     how: str,
     past: Corrected | None,
     uncorrected: Scene | None = None,
+    later: Later | None = None,
 ) -> tuple[Scene, Corrected]:
     """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
 
@@ -284,6 +291,7 @@ def settled_on(
         how: `light`, `firm` or `hold`.
         past: what the last call returned, its corrections those of the two frames before; None: nothing.
         uncorrected: the same two frames without them; None: as shown.
+        later: how somebody expects others to go on after the block; None: as they went (`carried_on`).
 
     Returns:
         The scene, and how all of its T frames were corrected.
@@ -295,6 +303,7 @@ def settled_on(
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
     offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
+    whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
     parted = last = None
     if known is not None:
         joints = body.joints(known)
@@ -307,31 +316,46 @@ def settled_on(
     turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
     for number in turns[moving[turns]]:
         one = agents == number
-        seen = as_known(shaped, known, one, sees[number], block)
+        ahead, others = None, sees[number] & ~one & shaped.present.any(dim=0)
+        if later is not None and bool(others.any()):
+            shown = slice(block - LEAD, block)
+            ahead = later(who[number], there[others], corrected(scene.slice(shown.start, block), whole[:, shown]))
+        if ahead is not None:
+            ahead = ahead.replace(body=body.id, valid=None, given=None).permute_agents(there)
+        seen = as_known(shaped, known, one, sees[number], block, ahead)
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
         offset[:, :, one] = changes[:, :, one]
+        whole[:, :, who[number]] = changes[:, :, number]
         if bool(sees[:, number].any()):
             done = corrected(shaped, changes * one[:, None])
             shaped = shaped.replace(body_rot=done.body_rot, T_world_root=done.T_world_root)
-    whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
-    whole[:, :, there] = offset
     made = corrected(scene, whole)
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, parted, who)
 
 
-def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int) -> Scene:
+def as_known(
+    scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int, ahead: Scene | None = None
+) -> Scene:
     """A block and the frames after it as one person knows them: the others go on from where they were last seen.
 
-    Arguments as for `settled_on`; one, sees (P,) bool, who it is and whom it sees.
+    Arguments as for `settled_on`; one, sees (P,) bool, who it is and whom it sees. ahead: the frames after the block as
+    it expects those that it sees to do; None: it takes it that they go on as they went.
     """
-    hidden = ~sees & ~one
+    hidden, seen = ~sees & ~one, sees & ~one
     if before is None:
         scene = scene.replace(present=scene.present & ~hidden)
     else:
         scene = carried_on(cat_time([before, scene]), hidden, before.frames - 1)
     lead = 0 if before is None else before.frames
-    return carried_on(scene, sees & ~one, lead + block - 1).slice(lead)
+    if ahead is None:
+        return carried_on(scene, seen, lead + block - 1).slice(lead)
+    scene = scene.slice(lead)
+    body_rot, root = (
+        torch.cat([now[:, :block], after], dim=1)
+        for now, after in ((scene.body_rot, ahead.body_rot), (scene.T_world_root, ahead.T_world_root))
+    )
+    return scene.with_poses(seen, body_rot, root)
 
 
 def parted_for(known: Scene, joints: Tensor, past: Corrected | None, who: tuple[int, ...], block: int) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from magnet.checks import require_whole
 from magnet.denoiser.core import DenoiserCore
 from magnet.export.trace import DenoisingTrace
-from magnet.generation.causal_bodies import own_view
+from magnet.generation.expected import own_view
 from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import Rollout
 from magnet.generation.world import WorldState

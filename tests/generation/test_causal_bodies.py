@@ -5,14 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from magnet.generation.causal_bodies import Expected, decode_bodies, finalize_bodies, own_view
+from magnet.generation.causal_bodies import EXPECTED, decode_bodies, finalize_bodies, others_expected
 from magnet.generation.conditioning import known_tokens, mask_unknown, receptive_field
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, posed
 from magnet.motion.scene import Scene
-from magnet.sampling.noise import LEVELS
 from magnet.sampling.options import SamplerOptions
-from magnet.sampling.schedule import Grid, Stage
+from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl
 from magnet.testing import random_scene
 
@@ -33,6 +32,11 @@ def finished(model, scene: Scene, options: SamplerOptions) -> tuple[WorldState, 
     world.placed[:] = True
     world.T_world_can = canonical_frame(scene.T_world_root)
     return world, known_tokens(model, scene, torch.ones_like(schedule.known))
+
+
+def everybody(tokens: torch.Tensor) -> torch.Tensor:
+    """Tokens (B, n, P, D) as what each of them expects. -> (B, P, n, P, D)"""
+    return tokens[:, None].expand(-1, tokens.shape[2], -1, -1, -1)
 
 
 def same(a: Scene, b: Scene) -> bool:
@@ -65,7 +69,7 @@ def test_nothing_behind_a_block_reaches_its_bodies(model, scene, options):
 def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene):
     world, tokens = finished(model, scene, BARE)
     ahead = receptive_field(model)[1]
-    behind = tokens[:, 8 : 8 + ahead], torch.ones(3, dtype=torch.bool)
+    behind = everybody(tokens[:, 8 : 8 + ahead]), torch.ones(3, dtype=torch.bool)
     expected = decode_bodies(world, tokens, 6, 8, 8, behind)
     known = decode_bodies(world, tokens, 6, 8, 8 + ahead)
     assert torch.allclose(expected.body_rot, known.body_rot, atol=1e-4)
@@ -77,7 +81,7 @@ def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene)
 def test_what_is_expected_behind_a_block_is_decoded_where_its_steps_lead(model, scene, smooth):
     world, tokens = finished(model, scene, dataclasses.replace(BARE, smooth_path=smooth))
     ahead = receptive_field(model)[1]
-    behind = tokens[:, 8 : 9 + ahead], torch.ones(3, dtype=torch.bool)
+    behind = everybody(tokens[:, 8 : 9 + ahead]), torch.ones(3, dtype=torch.bool)
     expected = decode_bodies(world, tokens, 6, 8, 8, behind, more=1)
     known = decode_bodies(world, tokens, 6, 9, 9 + ahead)
     assert expected.frames == known.frames == 12
@@ -93,7 +97,7 @@ def test_corrections_go_on_to_what_is_expected_of_those_who_told(model, scene):
         finalize_bodies(world, tokens, 6, 6, None)
         generator = torch.Generator().manual_seed(1)
         behind = tokens[:, 7:8] + lift * torch.randn(tokens[:, 7:8].shape, generator=generator)
-        finalize_bodies(world, tokens, 7, 7, (behind, torch.tensor([told, True, True])))
+        finalize_bodies(world, tokens, 7, 7, (everybody(behind), torch.tensor([told, True, True])))
         assert world.correction is not None and world.correction.offset.shape[1] == 2
         return world.given.slice(24, 28)
 
@@ -116,35 +120,41 @@ def test_what_has_been_shown_is_given_and_the_next_block_goes_on_from_there(mode
     assert step[:, 23].max() < 2 * step[:, 16:23].max()
 
 
-def test_each_agents_first_word_of_what_comes_counts():
-    """Later stages of the same block have seen more."""
-    rows = torch.full((2, 3, 2), LEVELS)
-    rows[:, :2] = 0
-    first, second = rows.clone(), rows.clone()
-    first[1, 2, 0], second[:, 2, 0], second[1, 2, 1] = 0, 0, 0
-    one, two = torch.full((1, 5, 2, 4), 1.0), torch.full((1, 5, 2, 4), 2.0)
-    expected = Expected(4)
-    expected.keep(Stage(5, first, ahead=2), one)
-    tokens, told = expected.behind(8)
-    assert tokens.shape == (1, 2, 2, 4) and told.tolist() == [True, False]
-    expected.keep(Stage(5, second, ahead=2), two)
-    tokens, told = expected.behind(8)
-    assert told.all() and (tokens[:, :, 0] == 1).all() and (tokens[:, :, 1] == 2).all()
-    assert expected.behind(9) is None
+@torch.no_grad()
+def test_others_are_expected_as_if_what_they_will_do_had_been_known(model, scene):
+    """From where they are by then: who is shown a metre further on goes on there."""
+    world, tokens = finished(model, scene, SamplerOptions(steps=2, blend=9, smooth_path=True))
+    ahead = receptive_field(model)[1]
+    behind, others = tokens[:, 8 : 8 + EXPECTED + ahead], torch.tensor([1, 2])
+    plain = decode_bodies(finished(model, scene, BARE)[0], tokens, 6, 8 + EXPECTED, 8 + EXPECTED + ahead)
+    later = others_expected(world, tokens, 8, EXPECTED, behind, 0, others, plain.slice(6, 8))
+    assert later.frames == 4 * EXPECTED
+    assert torch.allclose(later.body_rot[:, :, 1:], plain.body_rot[:, 8:, 1:], atol=1e-4)
+    assert torch.allclose(later.T_world_root[:, :, 1:], plain.T_world_root[:, 8:, 1:], atol=1e-4)
+    shifted = plain.slice(6, 8)
+    shifted.T_world_root[..., 0, 3] += 1.0
+    moved = others_expected(world, tokens, 8, EXPECTED, behind, 0, others, shifted).T_world_root[:, :, 1:, 0, 3]
+    assert (moved[:, 0] - later.T_world_root[:, 0, 1:, 0, 3] > 0.7).all()
 
 
-def test_every_agent_is_read_from_its_own_view_without_guidance():
-    """Scenes first, then views, then branches."""
-    hidden = torch.zeros(3, 2, 3, dtype=torch.bool)
-    hidden[0, 1, 1] = hidden[2, 1, 0] = True
-    views, of = hidden.unique(dim=0, return_inverse=True)
-    stage = Stage(0, torch.zeros(2, 2, 3, dtype=torch.long), ~hidden)
-    clean = torch.zeros(2, len(views), 4, 2, 3, 1)
-    clean += 100 * torch.arange(2).view(2, 1, 1, 1, 1, 1) + 10 * torch.arange(len(views)).view(1, -1, 1, 1, 1, 1)
-    clean += torch.arange(4).view(1, 1, 4, 1, 1, 1)
-    seen = own_view(clean.flatten(0, 2), stage, 2)
-    for scene in range(2):
-        for agent in range(3):
-            assert (seen[scene, :, agent] == 100 * scene + 10 * int(of[agent])).all()
-    plain = own_view(clean[:, 0].flatten(0, 1), dataclasses.replace(stage, visibility=None), 2)
-    assert plain.shape == (2, 2, 3, 1) and (plain[1] == 100).all()
+@torch.no_grad()
+def test_corrections_see_what_is_expected_of_those_whose_block_is_seen(model, scene):
+    """Two stand in each other; one is corrected, and expects the other to go on here or there."""
+    near = scene.replace(T_world_root=scene.T_world_root.clone())
+    near.T_world_root[:, :, 0] = near.T_world_root[:, :, 1]
+
+    def shown(change: float, seen: bool) -> Scene:
+        world, tokens = finished(model, near, SamplerOptions(steps=2, settle="firm"))
+        finalize_bodies(world, tokens, 6, 6, None)
+        if not seen:
+            world.saw.fill_(False)
+        behind = everybody(tokens[:, 7 : 7 + EXPECTED]).clone()
+        noise = torch.randn(behind[:, 0, :, 1:].shape, generator=torch.Generator().manual_seed(1))
+        behind[:, 0, :, 1:] += change * noise
+        finalize_bodies(world, tokens, 7, 7, (behind, torch.tensor([True, False, False])))
+        return world.given.slice(24, 28)
+
+    made = shown(0.0, True)
+    assert not same(made, shown(1.0, True))
+    assert same(shown(0.0, False), shown(1.0, False))
+    assert torch.equal(made.body_rot[:, :, 1:], near.body_rot[:, 24:28, 1:])  # given

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 
-from magnet.generation import causal_bodies
+from magnet.generation import causal_bodies, expected
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.options import SamplerOptions
@@ -125,7 +125,7 @@ def test_a_plan_that_hides_something_anywhere_is_shown_block_by_block():
 
 def breaking(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let poses look ahead in one way or another."""
-    made, kept = causal_bodies.decode_bodies, causal_bodies.Expected.keep
+    made, kept = causal_bodies.decode_bodies, expected.Expected.keep
 
     def looking_ahead(world: Any, tokens: Any, first: int, stop: int, near: int, *_: Any) -> Any:
         return made(world, tokens, first, stop, min(near + 2, tokens.shape[1]))
@@ -137,7 +137,7 @@ def breaking(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if how == "decoder":
         monkeypatch.setattr(causal_bodies, "decode_bodies", looking_ahead)
     else:
-        monkeypatch.setattr(causal_bodies.Expected, "keep", last_word)
+        monkeypatch.setattr(expected.Expected, "keep", last_word)
 
 
 def test_a_decoder_that_looks_ahead_is_found(monkeypatch: pytest.MonkeyPatch):
