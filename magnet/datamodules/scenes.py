@@ -28,6 +28,7 @@ from magnet.export.smpl_keys import (
     SHAPE,
     SMPLX_PELVIS,
     WHOLE,
+    Unreadable,
     posed,
     rotations,
 )
@@ -334,6 +335,8 @@ def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
     """Axis-angle numbers a frame, (T, D) or (P, T, D), D at least 66; and how many the file has."""
     try:
         whole = rotations(where, held)
+    except Unreadable as error:
+        raise DataError(str(error)) from error
     except ValueError as error:
         raise DataError(f"{error}; {AGAIN}") from error
     if whole.shape[-1] < WIDTH or 0 in whole.shape:

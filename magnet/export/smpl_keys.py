@@ -28,6 +28,30 @@ A file's transl is the pelvis without it."""
 SCALE = "smpl_scaling"
 """By which AIST++'s translations are to be divided."""
 
+UNIT_WITHIN, NEARLY_ALL, LOOKED_AT = 0.1, 0.9, 1000
+"""Of numbers that are no axis-angle: how far lengths and products are from those of unit vectors at right angles, as
+networks give them; in which share of them; and frames that are looked at."""
+OTHERS = {
+    9: ("matrices", "orthonormal", "save them as (frames, joints, 3, 3), which is read"),
+    6: (
+        "two columns of matrices (6D)",
+        "orthonormal",
+        "make matrices of them (the third column is the product of both) and save these as (frames, joints, 3, 3)",
+    ),
+    4: (
+        "quaternions",
+        "of unit length",
+        "convert them by scipy's Rotation.from_quat(numbers.reshape(-1, 4)[:, [1, 2, 3, 0]]).as_rotvec() where w comes "
+        "first, without the [:, [1, 2, 3, 0]] where it comes last",
+    ),
+}
+"""By how many numbers a joint has: what they are, how that is told, and what to do. Nine come first: of a matrix's
+nine numbers six may look like two columns."""
+
+
+class Unreadable(ValueError):
+    """Whole numbers that are no motion as it is read; the message says what to do."""
+
 
 def first_of(keys: Sequence[str], there: Collection[str]) -> str | None:
     """The first of several keys that is there."""
@@ -49,6 +73,7 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
         held: what the file has; None counts as absent.
 
     Raises:
+        Unreadable: quaternions, 6D numbers or flat matrices; says how to convert them.
         ValueError: a key is missing, no numbers, matrices that are no rotations, or unequal parts.
     """
     there = [key for key in (*WHOLE, *ORIENT, *BODY) if key in held and held[key] is not None]
@@ -66,6 +91,8 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     if body.ndim == 2 and np.ndim(found[0]) == 3 and np.shape(found[0])[1:] == (3, 3):
         found[0] = np.asarray(found[0])[:, None]  # a matrix a frame: of one person's body, not three frames of people
     root = _axis_angle(where, found[0], 3, joints=1)
+    if root.shape[-1] != 3:
+        raise ValueError(f"{where}: the root's rotations: got shape {np.shape(found[0])}, expected 3 numbers a frame")
     if root.shape[-2] != body.shape[-2]:
         raise ValueError(
             f"{where}: unequal numbers of frames: root {root.shape[-2]}, body {body.shape[-2]}; expected one length"
@@ -73,6 +100,32 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     if root.shape[:-1] != body.shape[:-1]:
         raise ValueError(f"{where}: root {root.shape} and body {body.shape} are of unequal numbers of people")
     return np.concatenate([root, body], axis=-1)
+
+
+def _require_vectors(where: object, array: Doubles) -> None:
+    """Refuse numbers (..., D) that are other rotations than axis-angle, which nobody's turns look like by chance."""
+    width = array.shape[-1]
+    frames = array.reshape(-1, width) if width else array.reshape(0, 1)
+    frames = frames[np.isfinite(frames).all(axis=1)]
+    frames = frames[:: 1 + len(frames) // LOOKED_AT].clip(-10.0, 10.0)
+    for size, (what, told, convert) in OTHERS.items():
+        if len(frames) and width % size == 0 and _orthonormal(frames.reshape(-1, size)):
+            raise Unreadable(
+                f"{where}: rotations: got shape {array.shape}: groups of {size} numbers are {told}, as {what} are, "
+                f"expected axis-angle, 3 numbers a joint; {convert}"
+            )
+
+
+def _orthonormal(groups: Doubles) -> bool:
+    """Whether nearly all (N, 4) have unit length, or nearly all (N, 6) or (N, 9) hold vectors that do, at right angles.
+
+    Six numbers may be two columns of a matrix one after the other, or row by row.
+    """
+    count, size = groups.shape
+    layouts = [groups[:, None]] if size == 4 else [groups.reshape(count, -1, 3)]
+    layouts += [groups.reshape(count, 3, 2).swapaxes(1, 2)] if size == 6 else []
+    off = [np.abs(each @ each.swapaxes(1, 2) - np.eye(each.shape[1])).max(axis=(1, 2)) for each in layouts]
+    return any((each < UNIT_WITHIN).mean() > NEARLY_ALL for each in off)
 
 
 def _axis_angle(where: object, value: Any, least: int = 0, joints: int | None = None) -> Doubles:
@@ -86,6 +139,7 @@ def _axis_angle(where: object, value: Any, least: int = 0, joints: int | None = 
         raise ValueError(f"{where}: rotations hold {array.dtype} {array.shape}, expected numbers a frame")
     with np.errstate(over="ignore", invalid="ignore"):
         array = array.astype(np.float64)
+    _require_vectors(where, array)
     if array.ndim >= 4 and array.shape[-2:] == (3, 3):
         known = np.isfinite(array).all(axis=(-2, -1))[..., None]
         array = np.where(known[..., None], array, np.eye(3))
