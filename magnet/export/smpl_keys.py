@@ -48,6 +48,9 @@ OTHERS = {
 """By how many numbers a joint has: what they are, how that is told, and what to do. Nine come first: of a matrix's
 nine numbers six may look like two columns."""
 
+LIKELY_PEOPLE = 20
+"""Of more people than these nobody has a file of fewer than a quarter as many frames: it has frames first."""
+
 
 class Unreadable(ValueError):
     """Whole numbers that are no motion as it is read; the message says what to do."""
@@ -73,13 +76,13 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
         held: what the file has; None counts as absent.
 
     Raises:
-        Unreadable: quaternions, 6D numbers or flat matrices; says how to convert them.
+        Unreadable: quaternions, 6D numbers or flat matrices, or frames before people; says how to convert them.
         ValueError: a key is missing, no numbers, matrices that are no rotations, or unequal parts.
     """
     there = [key for key in (*WHOLE, *ORIENT, *BODY) if key in held and held[key] is not None]
     whole = first_of(WHOLE, there)
     if whole is not None:
-        return _axis_angle(where, held[whole])
+        return _people_first(where, held, _axis_angle(where, held[whole]))
     found = []
     for keys in (ORIENT, BODY):
         key = first_of(keys, there)
@@ -87,7 +90,7 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
             has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
             raise ValueError(f"{where}: lacks {' or '.join(keys[:2])}; it has {has}")
         found.append(held[key])
-    body = _axis_angle(where, found[1], 3 * BODY_JOINTS - 3)
+    body = _people_first(where, held, _axis_angle(where, found[1], 3 * BODY_JOINTS - 3))
     if body.ndim == 2 and np.ndim(found[0]) == 3 and np.shape(found[0])[1:] == (3, 3):
         found[0] = np.asarray(found[0])[:, None]  # a matrix a frame: of one person's body, not three frames of people
     root = _axis_angle(where, found[0], 3, joints=1)
@@ -100,6 +103,19 @@ def rotations(where: object, held: Mapping[str, Any]) -> Doubles:
     if root.shape[:-1] != body.shape[:-1]:
         raise ValueError(f"{where}: root {root.shape} and body {body.shape} are of unequal numbers of people")
     return np.concatenate([root, body], axis=-1)
+
+
+def _people_first(where: object, held: Mapping[str, Any], poses: Doubles) -> Doubles:
+    """Numbers a frame as they are, but not where frames come before people; files of ours have people first."""
+    if poses.ndim != 3 or {"body", "surface_model_type"} <= set(held):
+        return poses
+    first, second = poses.shape[:2]
+    if first > LIKELY_PEOPLE and first > 4 * second:
+        raise Unreadable(
+            f"{where}: rotations: got shape {poses.shape}, which is {first} people of {second} frames; people come "
+            "first: transpose the first two axes of all arrays that have both, as array.swapaxes(0, 1) does"
+        )
+    return poses
 
 
 def _require_vectors(where: object, array: Doubles) -> None:

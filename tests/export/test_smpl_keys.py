@@ -107,3 +107,31 @@ def test_both_ways_in_refuse_with_the_way_out(tmp_path: Path) -> None:
     reader = ScenesReader(tmp_path)
     with pytest.raises(DataError, match=wanted):
         reader.read(reader.found()[0])
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 8])
+def test_frames_before_people_are_refused_with_what_to_do(count: int, apart: bool, tmp_path: Path) -> None:
+    """(T, P, D) looks like T people of P frames."""
+    long = np.concatenate([vectors(72)] * 3)
+    poses = np.stack([long] * count, axis=1)
+    place = np.zeros((*poses.shape[:2], 3))
+    parts = {"root_orient": poses[..., :3], "pose_body": poses[..., 3:]} if apart else {"poses": poses}
+    wanted = f"which is 120 people of {count} frames; people come first: transpose the first two axes"
+    with pytest.raises(Unreadable, match=wanted):
+        rotations("file", parts)
+    path = tmp_path / "walk.npz"
+    np.savez(path, trans=place, fps=30, **parts)
+    with pytest.raises(ValueError, match=wanted):
+        read_smplx(path, load_body())
+    reader = ScenesReader(tmp_path)
+    with pytest.raises(DataError, match=wanted):
+        reader.read(reader.found()[0])
+
+
+@pytest.mark.parametrize(("count", "frames"), [(1, 40), (2, 1), (8, 2), (20, 4), (50, 40), (200, 60)])
+def test_people_first_are_read_also_if_there_are_many_or_they_are_short(count: int, frames: int) -> None:
+    poses = np.stack([np.concatenate([vectors(72)] * 2)[:frames]] * count)
+    assert rotations("file", {"poses": poses}).shape == (count, frames, 72)
+    ours = {"poses": poses[:, :1], "body": np.array("open-1"), "surface_model_type": np.array("smplx")}
+    assert rotations("file", ours).shape == (count, 1, 72)
