@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported, without_gaps
 from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.reading.own import OwnReader, require_alone
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
-from magnet.datamodules.reading.recording import Axis, DataError, Family, Gender, Recording
+from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.reading.smpl_tracks import (
+    Numbers,
+    PosedTrack,
+    frame_numbers,
+    on_one_clock,
+    require_one_beginning,
+)
 from magnet.datamodules.registry import register_reader
 from magnet.export.smpl_keys import (
     BODY,
@@ -28,12 +33,14 @@ from magnet.export.smpl_keys import (
     SHAPE,
     SMPLX_PELVIS,
     WHOLE,
+    WORLD,
     Unreadable,
+    in_world,
     posed,
     rotations,
+    there_in_world,
 )
-from magnet.motion.resample import resample_points, resample_rotations, resample_valid
-from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec, to_rotvec
+from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
 
@@ -44,44 +51,6 @@ FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
 PERSON = "name of the person"
 """Our key for what somebody is called in a dict of people."""
 OPTIONAL = ("gender", SCALE, "body")
-
-
-@dataclass(frozen=True)
-class PosedTrack:
-    """One person: T frames of rotations, and where the pelvis or SMPL's translation is."""
-
-    fps: float
-    poses: Doubles  # (T, 22, 3) axis-angle, the pelvis's in the world
-    place: Doubles  # (T, 3)
-    betas: Doubles  # (10,)
-    valid: NDArray[np.bool_]  # (T,)
-    shapes_of: str = ""  # family of bodies that `betas` are of, where the file tells
-    body: str = ""  # id of the very body, where the file says it
-    at_pelvis: bool = False  # `place` is the pelvis itself
-    gender: Gender | None = None
-    name: str = ""
-    said_fps: float | None = None
-
-    @property
-    def frames(self) -> int:
-        return len(self.poses)
-
-    def slice(self, start: int, stop: int) -> PosedTrack:
-        part = slice(start, stop)
-        return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part])
-
-    def resampled(self, fps: float) -> PosedTrack:
-        if fps == self.fps:
-            return self
-        quat = resample_rotations(quat_from_rotvec(torch.from_numpy(self.poses)), self.fps, fps)
-        return replace(
-            self,
-            fps=fps,
-            said_fps=self.said_fps or self.fps,
-            poses=quat_to_rotvec(quat).numpy(),
-            place=resample_points(torch.from_numpy(self.place), self.fps, fps).numpy(),
-            valid=resample_valid(self.valid[:, None], self.fps, fps)[:, 0],
-        )
 
 
 @register_reader
@@ -113,6 +82,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
+    version: ClassVar[int] = 2  # frames are numbered, the world beats the camera
 
     def __init__(self, root: str | Path, fps: float | None = None, **kwargs: Any) -> None:
         super().__init__(root, **kwargs)
@@ -142,11 +112,21 @@ class ScenesReader(OwnReader[PosedTrack]):
                 )
         people = list(_people(path, held))
         notes: list[str] = []
-        tracks = [track for where, one in people for track in self._tracks(where, one, notes)]
+        tracks: list[PosedTrack] = []
+        numbers: list[Numbers | None] = []
+        names: list[str] = []
+        for where, one in people:
+            if there_in_world(one.keys()):
+                notes.append(f"{' and '.join(WORLD)} are taken, not what the camera sees")
+            found = list(self._tracks(where, one, notes))
+            tracks += found
+            numbers += [frame_numbers(where, one, track.frames, p) for p, track in enumerate(found)]
+            names += [where if len(found) == 1 else f"{where}, person {p + 1}" for p in range(len(found))]
+        tracks, said = on_one_clock(path, tracks, numbers, names)
         if len(people) > 1:
-            one_length(path, {where: track.frames for (where, _), track in zip(people, tracks, strict=True)})
+            one_length(path, {name: track.frames for name, track in zip(names, tracks, strict=True)})
         require_alone(path, len(tracks), alone)
-        return tracks, notes
+        return tracks, [*notes, *said]
 
     def _tracks(self, where: str, held: Mapping[str, Any], notes: list[str]) -> Iterator[PosedTrack]:
         """One person, or several along the first axis."""
@@ -190,6 +170,13 @@ class ScenesReader(OwnReader[PosedTrack]):
                 valid=tracked,
                 gender=gender_of(_one_of(held.get("gender"), p)),
             )
+
+    def together(self, group: SceneFiles, tracks: list[PosedTrack], notes: list[str]) -> list[PosedTrack]:
+        """With one beginning, unless a table says when each begins."""
+        files = [person_file.file for person_file in group.people]
+        if len(files) > 1 and self.table is None:
+            require_one_beginning(files, tracks)
+        return tracks
 
     def recording(
         self, where: str, tracks: Sequence[PosedTrack], names: Sequence[str], notes: Sequence[str]
@@ -292,7 +279,7 @@ def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
     held = mapping(path, held)
     if _posed(held):
-        yield str(path), held
+        yield str(path), in_world(held)
         return
     shared = {key: value for key, value in held.items() if key in (*RATE, *OPTIONAL)}
     inside = {key: value for key, value in held.items() if _posed(value)}
@@ -304,7 +291,7 @@ def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         )
     for p, (key, value) in enumerate(inside.items()):
         mine = {shared_key: _one_of(said, p) for shared_key, said in shared.items()}
-        yield f"{path}, {key}", {**mine, PERSON: key, **mapping(f"{path}, {key}", value)}
+        yield f"{path}, {key}", {**mine, PERSON: key, **in_world(mapping(f"{path}, {key}", value))}
 
 
 def _posed(held: Any) -> bool:

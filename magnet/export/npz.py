@@ -23,6 +23,7 @@ from magnet.export.smpl_keys import (
     SMPLX_PELVIS,
     WHOLE,
     first_of,
+    in_world,
     rotations,
 )
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
@@ -258,8 +259,9 @@ def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, s
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        with load_npz(path) as file:
-            there = set(file.files)
+        with load_npz(path) as archive:
+            file = in_world(archive)
+            there = set(file)
             ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
             _require_keys(path, there, ours, in_fps)
             poses, transl = rotations(path, file), file[first_of(("transl", *PLACE), there) or ""]

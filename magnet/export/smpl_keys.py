@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,8 @@ Doubles = NDArray[np.float64]
 WHOLE = ("poses", "pose", "smpl_poses", "fullpose", "full_pose")
 ORIENT, BODY = ("root_orient", "global_orient", "poses_root"), ("pose_body", "body_pose", "poses_body")
 PLACE = ("trans", "transl", "smpl_trans", "translation")
+WORLD = ("pose_world", "trans_world")
+"""Rotations and places in the world, of files that have those that a camera sees under the other keys."""
 RATE = ("mocap_frame_rate", "mocap_framerate", "fps", "framerate", "frame_rate")
 SHAPE = ("betas", "shape", "beta")
 """Keys that files may have for the same thing."""
@@ -63,7 +66,20 @@ def first_of(keys: Sequence[str], there: Collection[str]) -> str | None:
 
 def posed(there: Collection[str]) -> bool:
     """Whether a file with these keys holds rotations of somebody."""
-    return first_of((*WHOLE, *ORIENT), there) is not None
+    return first_of((*WHOLE, *ORIENT), there) is not None or there_in_world(there)
+
+
+def there_in_world(there: Collection[str]) -> bool:
+    """Whether a file with these keys says where somebody is in the world, beside what a camera sees."""
+    return all(key in there for key in WORLD)
+
+
+def in_world(held: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a file holds, with motion in the world, where it has that, under the keys that are looked for first."""
+    if not there_in_world(held.keys()):
+        return held
+    pose, place = (held[key] for key in WORLD)
+    return ChainMap({WHOLE[0]: pose, **dict.fromkeys(PLACE, place)}, held)  # type: ignore[arg-type]
 
 
 def rotations(where: object, held: Mapping[str, Any]) -> Doubles:

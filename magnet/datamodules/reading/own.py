@@ -209,6 +209,10 @@ class OwnReader(Reader, Generic[T]):
             DataError: the file is damaged, or not what it should be.
         """
 
+    def together(self, group: SceneFiles, tracks: list[T], notes: list[str]) -> list[T]:
+        """Everybody in a scene, before any part of it is cut out; what should be known of them is added to `notes`."""
+        return tracks
+
     @abstractmethod
     def recording(self, where: str, tracks: Sequence[T], names: Sequence[str], notes: Sequence[str]) -> Recording:
         """People with equal rates and lengths as one recording."""
@@ -217,6 +221,7 @@ class OwnReader(Reader, Generic[T]):
         """The scene, or the part of it that the take is."""
         group, part = self._meant(take)
         tracks, names, notes = self._people(group)
+        tracks = self.together(group, tracks, notes)
         frames = min(track.frames for track in tracks)
         if len({track.frames for track in tracks}) > 1:
             lengths = ", ".join(f"{n or p} {t.frames}" for p, (n, t) in enumerate(zip(names, tracks, strict=True)))

@@ -1,0 +1,155 @@
+"""People out of files of SMPL's family: their motion, brought onto one clock where files number its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magnet.datamodules.reading.arrays import Doubles, floats
+from magnet.datamodules.reading.recording import DataError, Gender
+from magnet.motion.resample import resample_points, resample_rotations, resample_valid
+from magnet.motion.rotations import quat_from_rotvec, quat_to_rotvec
+
+Numbers = NDArray[np.int64]
+
+FRAMES = "frame_ids"
+"""Under which trackers say which frames of a video somebody was seen in."""
+LONGEST = 1_000_000
+"""Frames between the first and the last one of a file that are believed: nine hours at 30 a second."""
+
+
+@dataclass(frozen=True)
+class PosedTrack:
+    """One person: T frames of rotations, and where the pelvis or SMPL's translation is."""
+
+    fps: float
+    poses: Doubles  # (T, 22, 3) axis-angle, the pelvis's in the world
+    place: Doubles  # (T, 3)
+    betas: Doubles  # (10,)
+    valid: NDArray[np.bool_]  # (T,)
+    shapes_of: str = ""  # family of bodies that `betas` are of, where the file tells
+    body: str = ""  # id of the very body, where the file says it
+    at_pelvis: bool = False  # `place` is the pelvis itself
+    gender: Gender | None = None
+    name: str = ""
+    said_fps: float | None = None
+    first: int | None = None  # number of its first frame, where the file numbers them
+
+    @property
+    def frames(self) -> int:
+        return len(self.poses)
+
+    def slice(self, start: int, stop: int) -> PosedTrack:
+        part = slice(start, stop)
+        return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part])
+
+    def resampled(self, fps: float) -> PosedTrack:
+        if fps == self.fps:
+            return self
+        quat = resample_rotations(quat_from_rotvec(torch.from_numpy(self.poses)), self.fps, fps)
+        return replace(
+            self,
+            fps=fps,
+            said_fps=self.said_fps or self.fps,
+            poses=quat_to_rotvec(quat).numpy(),
+            place=resample_points(torch.from_numpy(self.place), self.fps, fps).numpy(),
+            valid=resample_valid(self.valid[:, None], self.fps, fps)[:, 0],
+        )
+
+
+# -- one clock ---------------------------------------------------------------------------------
+
+
+def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: int) -> Numbers | None:
+    """Which frames of a video a person's frames are, (T,); None: the file does not say.
+
+    Args:
+        where: for messages.
+        held: what the file has of one person, or of several along the first axis.
+        frames: T.
+        person: which of several.
+
+    Raises:
+        DataError: not one whole number a frame, or they do not rise.
+    """
+    value = held.get(FRAMES)
+    if value is None:
+        return None
+    said = floats(f"{where}: {FRAMES}", value[person] if np.ndim(value) == 2 else value, (frames,))
+    numbers = said.astype(np.int64)
+    if (said != numbers).any() or (np.diff(numbers) <= 0).any() or np.ptp(numbers) >= LONGEST:
+        raise DataError(
+            f"{where}: {FRAMES}: got {said[0]:g} to {said[-1]:g} for {frames} frames, expected whole numbers that rise "
+            f"from frame to frame, by less than {LONGEST:,} in all; mend them, or leave them out"
+        )
+    return numbers
+
+
+def on_one_clock(
+    path: Path, tracks: Sequence[PosedTrack], numbers: Sequence[Numbers | None], names: Sequence[str]
+) -> tuple[list[PosedTrack], list[str]]:
+    """People of one file from the frame that the last of them begins with to the one that the first of them ends with.
+
+    Frames between these in which a person was not seen are not valid.
+
+    Args:
+        path: the file.
+        tracks: its people.
+        numbers: of each one's frames.
+        names: of the people, for messages.
+
+    Returns:
+        The people, and what should be known of them.
+
+    Raises:
+        DataError: only some have numbers, or they share no frame.
+    """
+    known = [one for one in numbers if one is not None]
+    if not known:
+        return list(tracks), []
+    if len(known) < len(tracks):
+        lack = ", ".join(name for name, one in zip(names, numbers, strict=True) if one is None)
+        raise DataError(f"{path}: {FRAMES} say when others were seen, but {lack} has none; give everybody theirs")
+    spans = [f"{one[0]} to {one[-1]}" for one in known]
+    first, last = max(one[0] for one in known), min(one[-1] for one in known)
+    if first > last:
+        raise DataError(f"{path}: people were never seen together: {FRAMES} {', '.join(spans)}; save them apart")
+    step = max(int(np.gcd.reduce(np.concatenate([one - known[0][0] for one in known]))), 1)
+    clock = np.arange(first, last + 1, step)
+    notes = [f"{path}: {FRAMES} rise by {step}: frames are taken for neighbours"] if step > 1 else []
+    if len(set(spans)) > 1:
+        notes.append(f"{path}: {FRAMES} are {', '.join(spans)}: cut to what all have, {first} to {last}")
+    aligned = []
+    for track, one, name in zip(tracks, known, names, strict=True):
+        at = np.searchsorted(one, clock, side="right") - 1
+        seen = one[at] == clock
+        aligned.append(
+            replace(track, poses=track.poses[at], place=track.place[at], valid=track.valid[at] & seen, first=int(first))
+        )
+        if lost := int((~seen).sum()):
+            notes.append(f"{name}: {lost} of {len(clock)} frames are not in {FRAMES}, taken as not tracked: cut out")
+    return aligned, notes
+
+
+def require_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> None:
+    """Refuse files of one scene whose frames have other numbers at their beginnings: they are laid on each other there.
+
+    Args:
+        files: of the scene.
+        tracks: the person of each.
+
+    Raises:
+        DataError: they begin with different numbers.
+    """
+    said = {file.name: track.first for file, track in zip(files, tracks, strict=True) if track.first is not None}
+    if len(set(said.values())) > 1:
+        raise DataError(
+            f"{files[0]}: {FRAMES} of its scene's files begin at {', '.join(f'{n} ({f})' for f, n in said.items())}: "
+            "say when each begins, in seconds, by `start` in a table (docs/own.md), or save the people in one file"
+        )

@@ -1,0 +1,129 @@
+"""Files that say which frames of a video somebody was seen in, and where in the world that was."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnet.body import load_body
+from magnet.datamodules.fakes.motion import people
+from magnet.datamodules.reading.recording import DataError, Recording
+from magnet.datamodules.scenes import ScenesReader
+from magnet.export.npz import read_smplx
+from tests.datamodules.readers import world_joints
+
+TRUE = people(60, 2, 30.0, 3)
+
+
+def seen(p: int, frames: list[int], numbered: bool = True) -> dict[str, Any]:
+    """One person in these frames, as video trackers give them."""
+    poses = np.concatenate([TRUE.poses[frames, p].reshape(-1, 66), np.zeros((len(frames), 6))], axis=1)
+    held = {"pose": poses, "trans": TRUE.transl[frames, p], "betas": np.tile(TRUE.betas[p], (len(frames), 1))}
+    return held | ({"frame_ids": np.array(frames)} if numbered else {})
+
+
+def read(root: Path, held: Any = None) -> Recording:
+    if held is not None:
+        (root / "video.pkl").write_bytes(pickle.dumps(held))
+    reader = ScenesReader(root, fps=30.0)
+    return reader.read(reader.found()[0])
+
+
+def off(found: Recording, first: int) -> float:
+    """Metres between people and where they were, from a frame of the video on, where they were seen."""
+    wanted = TRUE.positions[first : first + found.frames]
+    error = np.abs(world_joints(found, "smplx") - wanted).max(axis=(2, 3))
+    assert found.valid is not None
+    return float(error[found.valid].max())
+
+
+@pytest.mark.parametrize("second", [(20, 60), (20, 50), (10, 40)])
+def test_people_are_laid_on_each_other_by_the_numbers_of_frames(second: tuple[int, int], tmp_path: Path) -> None:
+    found = read(tmp_path, {0: seen(0, [*range(50)]), 1: seen(1, [*range(*second)])})
+    assert found.frames == min(50, second[1]) - second[0]
+    assert off(found, second[0]) < 1e-5
+    (note,) = (note for note in found.notes if "frame_ids" in note)
+    assert (
+        f"0 to 49, {second[0]} to {second[1] - 1}: cut to what all have, {second[0]} to {found.frames + second[0] - 1}"
+        in note
+    )
+
+
+def test_frames_in_which_somebody_was_not_seen_are_not_valid(tmp_path: Path) -> None:
+    found = read(tmp_path, [seen(0, [*range(60)]), seen(1, [*range(20), *range(25, 60)])])
+    assert (found.frames, off(found, 0) < 1e-5) == (60, True)
+    assert found.valid is not None and np.argwhere(~found.valid).tolist() == [[frame, 1] for frame in range(20, 25)]
+    assert any("person2: 5 of 60 frames are not in frame_ids, taken as not tracked: cut out" in n for n in found.notes)
+    alone = read(tmp_path, seen(1, [*range(20), *range(25, 60)]))
+    assert (alone.frames, alone.valid is not None and int(alone.valid.sum())) == (60, 55)
+
+
+def test_people_first_arrays_have_numbers_for_all_or_for_each(tmp_path: Path) -> None:
+    both = [seen(0, [*range(40)]), seen(1, [*range(10, 50)])]
+    held = {key: np.stack([one[key] for one in both]) for key in both[0]}
+    assert off(read(tmp_path, held), 10) < 1e-5
+    same = [seen(p, [*range(5, 45)]) for p in (0, 1)]
+    held = {key: np.stack([one[key] for one in same]) for key in same[0]} | {"frame_ids": np.arange(5, 45)}
+    assert off(read(tmp_path, held), 5) < 1e-5
+
+
+def test_every_second_frame_of_a_video_is_a_neighbour_of_the_next(tmp_path: Path) -> None:
+    held = [seen(0, [*range(40)]), seen(1, [*range(10, 50)])]
+    for one in held:
+        one["frame_ids"] = 2 * one["frame_ids"] + 1
+    found = read(tmp_path, held)
+    assert (found.frames, off(found, 10) < 1e-5) == (30, True)
+    assert any("frame_ids rise by 2: frames are taken for neighbours" in note for note in found.notes)
+
+
+REFUSED: dict[str, tuple[list[dict[str, Any]], str]] = {
+    "apart": ([seen(0, [*range(20)]), seen(1, [*range(30, 60)])], "never seen together: frame_ids 0 to 19, 30 to 59"),
+    "one only": ([seen(0, [*range(20)]), seen(1, [*range(20)], False)], "person2 has none; give everybody theirs"),
+    "falling": (
+        [seen(0, [3, 2, 1]), seen(1, [1, 2, 3])],
+        "person1: frame_ids: got 3 to 1 for 3 frames, expected whole",
+    ),
+    "no numbers": ([seen(0, [1, 2]) | {"frame_ids": np.array([1.0, 2.5])}], "expected whole numbers that rise"),
+    "far": ([seen(0, [1, 2]) | {"frame_ids": np.array([1, 2**40])}], r"by less than 1,000,000 in all"),
+    "too few": (
+        [seen(0, [1, 2, 3]) | {"frame_ids": np.array([1, 2])}],
+        r"frame_ids: got shape \(2,\), expected \(3,\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_numbers_that_do_not_tell_are_refused(kind: str, tmp_path: Path) -> None:
+    held, message = REFUSED[kind]
+    with pytest.raises(DataError, match=message):
+        read(tmp_path, held)
+
+
+def test_files_of_one_scene_that_begin_with_other_frames_need_a_table(tmp_path: Path) -> None:
+    for p, first in enumerate((0, 15)):
+        np.savez(tmp_path / f"walk_{'AB'[p]}.npz", **seen(p, [*range(first, 60)]))
+    with pytest.raises(DataError, match=r"frame_ids of its scene's files begin at 0 \(walk_A.npz\), 15 \(walk_B.npz\)"):
+        read(tmp_path)
+    (tmp_path / "people.csv").write_text("scene,person,file,start\nwalk,A,walk_A.npz,0\nwalk,B,walk_B.npz,0.5\n")
+    assert off(read(tmp_path), 15) < 1e-5
+
+
+def test_places_in_the_world_beat_those_that_a_camera_sees(tmp_path: Path) -> None:
+    held = [seen(p, [*range(60)], False) for p in (0, 1)]
+    seen_so = [{**one, "pose_world": one["pose"], "trans_world": one["trans"]} for one in held]
+    for one in seen_so:
+        one["pose"], one["trans"] = np.zeros_like(one["pose"]), np.zeros_like(one["trans"])
+    found = read(tmp_path, seen_so)
+    assert off(found, 0) < 1e-5
+    assert "pose_world and trans_world are taken, not what the camera sees" in found.notes
+    alone = {key: one for key, one in seen_so[0].items() if key not in ("pose", "trans")}
+    assert read(tmp_path, [alone, alone]).frames == 60
+    np.savez(tmp_path / "camera.npz", fps=30, **seen_so[0])
+    np.savez(tmp_path / "plain.npz", fps=30, **held[0])
+    body = load_body()
+    shown, wanted = (read_smplx(tmp_path / f"{name}.npz", body)[0] for name in ("camera", "plain"))
+    assert (shown.T_world_root - wanted.T_world_root).abs().max() == 0
