@@ -14,11 +14,12 @@ from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length
 from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.reading.own import OwnReader, require_alone
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
-from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.reading.recording import DataError, Family, Recording
 from magnet.datamodules.reading.smpl_tracks import (
     Numbers,
     PosedTrack,
     frame_numbers,
+    of_own_axes,
     on_one_clock,
     require_one_beginning,
 )
@@ -40,7 +41,7 @@ from magnet.export.smpl_keys import (
     rotations,
     there_in_world,
 )
-from magnet.motion.rotations import from_rotvec, to_rotvec
+from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
 
@@ -82,7 +83,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
-    version: ClassVar[int] = 2  # frames are numbered, the world beats the camera
+    version: ClassVar[int] = 2  # frames are numbered, the world beats the camera, each file has its axis
 
     def __init__(self, root: str | Path, fps: float | None = None, **kwargs: Any) -> None:
         super().__init__(root, **kwargs)
@@ -172,16 +173,20 @@ class ScenesReader(OwnReader[PosedTrack]):
             )
 
     def together(self, group: SceneFiles, tracks: list[PosedTrack], notes: list[str]) -> list[PosedTrack]:
-        """With one beginning, unless a table says when each begins."""
+        """With one beginning, unless a table says when each begins, and the axis that points up in each one's file."""
         files = [person_file.file for person_file in group.people]
         if len(files) > 1 and self.table is None:
             require_one_beginning(files, tracks)
+        if any(track.body for track in tracks):  # a scene of ours: y
+            return tracks
+        tracks, said = of_own_axes(files, tracks)
+        notes += said
         return tracks
 
     def recording(
         self, where: str, tracks: Sequence[PosedTrack], names: Sequence[str], notes: Sequence[str]
     ) -> Recording:
-        """Rotations and translations, the up axis by where people stand."""
+        """Rotations and translations, and the axis that points up in each one's file."""
         kinds = {(track.body, track.at_pelvis) for track in tracks}
         if len(kinds) > 1:
             bodies = {track.body for track in tracks}
@@ -198,10 +203,12 @@ class ScenesReader(OwnReader[PosedTrack]):
             )
         poses = np.stack([track.poses for track in tracks], axis=1)
         place = np.stack([track.place for track in tracks], axis=1)
+        ups = tuple(track.up for track in tracks)
         genders = tuple(track.gender or "neutral" for track in tracks) if any(track.gender for track in tracks) else ()
         return Recording(
             fps=tracks[0].fps,
-            up="+y" if body else _standing(poses[:, :, 0]),
+            up=tracks[0].up,
+            ups=ups if len(set(ups)) > 1 else (),
             poses=poses,
             transl=None if at_pelvis else place,
             pelvis=place if at_pelvis else None,
@@ -342,10 +349,3 @@ def _one_of(value: Any, person: int) -> Any:
         if isinstance(value, list | tuple | np.ndarray) and np.ndim(value) == 1 and len(value) > person
         else value
     )
-
-
-def _standing(root: Doubles) -> Axis:
-    """The up axis of a file, found from the pelvises' rotations. (T, P, 3) axis-angle -> +x ... -z"""
-    up = from_rotvec(torch.from_numpy(root))[..., 1].mean(dim=(0, 1))
-    axis = int(up.abs().argmax())
-    return ("-" if up[axis] < 0 else "+") + "xyz"[axis]  # type: ignore[return-value]

@@ -20,6 +20,7 @@ from magnet.datamodules.clip import Clip, Split
 from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.export.smpl_keys import SMPLX_PELVIS
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_quat, quat_from_rotvec, to_quat
@@ -75,10 +76,11 @@ class WorldMotion:
     notes: tuple[str, ...] = ()
 
     def turned(self, R: Tensor) -> WorldMotion:
-        """Seen from a world turned by R_new_old (3, 3) float64."""
+        """Seen from a world turned by R_new_old (3, 3) float64, or each from an own one, (P, 3, 3)."""
         rotations = self.rotations.clone()
         rotations[:, :, 0] = R.float() @ rotations[:, :, 0]
-        return replace(self, rotations=rotations, pelvis=self.pelvis @ R.T, joints=self.joints @ R.T.float())
+        pelvis = self.pelvis @ R.T if R.ndim == 2 else (self.pelvis[..., None, :] @ R.mT)[..., 0, :]
+        return replace(self, rotations=rotations, pelvis=pelvis, joints=self.joints @ R.mT.float())
 
     def lowered(self, height: float) -> WorldMotion:
         """With the floor, now at `height`, at 0."""
@@ -155,7 +157,10 @@ def _moved(recording: Recording, body: Body, options: CanonicalizeOptions) -> tu
     valid, wild = check_people.screened(recording, valid)
     if recording.poses is not None:
         motion, flags = _posed(recording, valid, body)
-        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=options.up is not None)
+        own = recording.ups if options.up is None else ()  # each one's axis is known, so that somebody may lie
+        if own:
+            motion, up = motion.turned(torch.stack([R_WORLD_FILE[axis] for axis in own])), "+y"
+        check_motion.check_up(up, motion.joints.numpy(), motion.valid, chosen=bool(own) or options.up is not None)
         motion = motion.turned(R_WORLD_FILE[up])
         check_motion.check_lengths(motion.joints.numpy(), motion.pelvis.numpy(), motion.valid)
     else:
@@ -192,6 +197,8 @@ def of_body(recording: Recording, body: Body, source: str, family: Family) -> Re
         )
     said = f"rotations of SMPL's family on body {body.id} in its mean shape: limbs are approximate without --body FILE"
     flat = np.zeros_like(np.asarray(recording.betas))
+    if recording.ups and recording.transl is not None:  # in worlds of different axes it matters whose pelvis is at rest
+        recording = replace(recording, transl=None, pelvis=recording.transl + np.asarray(SMPLX_PELVIS))
     return replace(recording, betas=flat, genders=(), notes=(*recording.notes, said))
 
 

@@ -104,6 +104,7 @@ class Recording:
     skeletons: tuple[
         PosedSkeleton, ...
     ] = ()  # (P,) skeletons with rotations, which say more of a body than `positions`
+    ups: tuple[Axis, ...] = ()  # (P,) of each one's file, in place of `up`, where rotations come from different worlds
     said_fps: float | None = None  # of the files, where `fps` is another because motion was resampled on the way
 
     def __post_init__(self) -> None:
@@ -125,7 +126,12 @@ class Recording:
                     f"{name}: got {got}, expected {want} for {T} frames of {P} people; take the file as it was "
                     "published"
                 )
-        for name, words in {"persons": self.persons, "genders": self.genders, "skeletons": self.skeletons}.items():
+        for name, words in {
+            "persons": self.persons,
+            "genders": self.genders,
+            "skeletons": self.skeletons,
+            "ups": self.ups,
+        }.items():
             if words and len(words) != P:
                 raise DataError(
                     f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} "

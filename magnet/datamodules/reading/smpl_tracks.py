@@ -1,4 +1,4 @@
-"""People out of files of SMPL's family: their motion, brought onto one clock where files number its frames."""
+"""People out of files of SMPL's family: their motion, the clock of numbered frames, and each file's up axis."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magnet.body import load_body
 from magnet.datamodules.reading.arrays import Doubles, floats
-from magnet.datamodules.reading.recording import DataError, Gender
+from magnet.datamodules.reading.recording import Axis, DataError, Gender
+from magnet.export.npz import stance_in
+from magnet.export.rig import UP
+from magnet.export.smpl_keys import SMPLX_PELVIS
+from magnet.export.upright import agreed, axis_of, said
+from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
-from magnet.motion.rotations import quat_from_rotvec, quat_to_rotvec
+from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec
+from magnet.motion.scene import Scene
 
 Numbers = NDArray[np.int64]
 
@@ -40,6 +47,7 @@ class PosedTrack:
     name: str = ""
     said_fps: float | None = None
     first: int | None = None  # number of its first frame, where the file numbers them
+    up: Axis = "+y"  # of its own file
 
     @property
     def frames(self) -> int:
@@ -81,12 +89,13 @@ def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: i
     value = held.get(FRAMES)
     if value is None:
         return None
-    said = floats(f"{where}: {FRAMES}", value[person] if np.ndim(value) == 2 else value, (frames,))
-    numbers = said.astype(np.int64)
-    if (said != numbers).any() or (np.diff(numbers) <= 0).any() or np.ptp(numbers) >= LONGEST:
+    given = floats(f"{where}: {FRAMES}", value[person] if np.ndim(value) == 2 else value, (frames,))
+    with np.errstate(invalid="ignore"):
+        numbers = given.astype(np.int64)
+    if (given != numbers).any() or (np.diff(given) <= 0).any() or np.ptp(given) >= LONGEST:
         raise DataError(
-            f"{where}: {FRAMES}: got {said[0]:g} to {said[-1]:g} for {frames} frames, expected whole numbers that rise "
-            f"from frame to frame, by less than {LONGEST:,} in all; mend them, or leave them out"
+            f"{where}: {FRAMES}: got {given[0]:g} to {given[-1]:g} for {frames} frames, expected whole numbers that "
+            f"rise from frame to frame, by less than {LONGEST:,} in all; mend them, or leave them out"
         )
     return numbers
 
@@ -147,9 +156,59 @@ def require_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -
     Raises:
         DataError: they begin with different numbers.
     """
-    said = {file.name: track.first for file, track in zip(files, tracks, strict=True) if track.first is not None}
-    if len(set(said.values())) > 1:
+    begun = {file.name: track.first for file, track in zip(files, tracks, strict=True) if track.first is not None}
+    if len(set(begun.values())) > 1:
         raise DataError(
-            f"{files[0]}: {FRAMES} of its scene's files begin at {', '.join(f'{n} ({f})' for f, n in said.items())}: "
+            f"{files[0]}: {FRAMES} of its scene's files begin at {', '.join(f'{n} ({f})' for f, n in begun.items())}: "
             "say when each begins, in seconds, by `start` in a table (docs/own.md), or save the people in one file"
         )
+
+
+# -- what points up ----------------------------------------------------------------------------
+
+
+def of_own_axes(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tuple[list[PosedTrack], list[str]]:
+    """People with the axis that points up in each one's file, as `magnet export` finds it: somebody may lie.
+
+    Args:
+        files: of one scene: one for each person, or one for all.
+        tracks: its people.
+
+    Returns:
+        The people; and what is said of files in which somebody lies or that have different axes.
+    """
+    one_for_all = len(files) < len(tracks)
+    ups = [standing(tracks)] * len(tracks) if one_for_all else [standing([track]) for track in tracks]
+    notes: list[str] = []
+    if len(set(ups)) > 1:
+        body = load_body()
+        found = [
+            stance_in(_scene(track, up, body.id), body, up, sure=False) for track, up in zip(tracks, ups, strict=True)
+        ]
+        ups = agreed(found)
+        notes = [f"{file.name}: {note}" for k, file in enumerate(files) for note in said(found, ups, k)]
+    return [replace(track, up=_signed(up)) for track, up in zip(tracks, ups, strict=True)], notes
+
+
+def standing(tracks: Sequence[PosedTrack]) -> str:
+    """The axis along which pelvises of a file stand, a key of `magnet.export.rig.UP`."""
+    torsos = torch.stack([from_rotvec(torch.from_numpy(track.poses[:, 0]))[..., 1] for track in tracks])
+    return axis_of(torsos.mean(dim=(0, 1)).numpy())
+
+
+def _scene(track: PosedTrack, up: str, body: str) -> Scene:
+    """One person in the mean shape, y up."""
+    turned = from_rotvec(torch.from_numpy(track.poses))
+    M, pelvis = torch.from_numpy(UP[up]), torch.from_numpy(track.place + np.asarray(SMPLX_PELVIS))
+    return Scene(
+        body_rot=turned[None, :, None, 1:].float(),
+        T_world_root=rigid(M @ turned[:, 0], pelvis @ M.T)[None, :, None].float(),
+        betas=torch.zeros(1, 1, 10),
+        present=torch.ones(1, 1, dtype=torch.bool),
+        fps=track.fps,
+        body=body,
+    )
+
+
+def _signed(up: str) -> Axis:
+    return up if up.startswith("-") else f"+{up}"  # type: ignore[return-value]
