@@ -22,6 +22,7 @@ from magnet import checkpoints
 from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_folder, run_folder, run_logs, run_record
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
+from magnet.cli.interrupts import EndOfStep
 from magnet.cli.parser import Parser
 from magnet.cli.quiet import quiet
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
@@ -77,8 +78,9 @@ def run_trainer(command: str, arguments: list[str]) -> int:
             writing(folder, f"choose another --out{goes_on}"),
         ):
             MagnetCLI(dataclasses.replace(request, folder=folder))
-    except SIGTERMException:
-        return 143
+    except SIGTERMException as stop:
+        assert isinstance(stop.code, int)
+        return stop.code
     except SystemExit:
         if answers.recall(f"{command} flags") is None:  # the next mistyped flag is answered at once
             answers.keep(flag_answers(help_parser(command)))
@@ -144,6 +146,7 @@ class MagnetCLI(LightningCLI):
         self.command, self.checkpoint, self.folder = request.command, request.checkpoint, request.folder
         self.evaluator: Evaluator | None = None
         self.predicted: list[Any] = []
+        self.ctrl_c = EndOfStep()
         self.models, self.data = named_classes()
         with contextlib.ExitStack() as self.held:  # a training's folder, until it ends
             super().__init__(
@@ -258,6 +261,8 @@ class MagnetCLI(LightningCLI):
         if fit and not config.get("fast_dev_run"):
             run_folder.require_folder(self.folder)
             callbacks = [StepNumbers(), *callbacks, Duration(), optimizers.SameOptimizer(self.checkpoint)]
+        if fit:
+            callbacks.append(self.ctrl_c)
         if not fit and config.get("enable_checkpointing") is None:
             config["enable_checkpointing"] = False
         self.record = self._record()
@@ -332,6 +337,14 @@ class MagnetCLI(LightningCLI):
 
     before_test = _evaluate
     before_predict = _evaluate
+
+    def fit(self, **words: Any) -> None:
+        """The Trainer's, with an exit code that says which signal ended it."""
+        try:
+            self.trainer.fit(**words)
+        except SIGTERMException as stop:
+            stop.code = self.ctrl_c.code
+            raise
 
     def predict(self, **words: Any) -> None:
         """The Trainer's, keeping what it returns."""

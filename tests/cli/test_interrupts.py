@@ -1,0 +1,160 @@
+"""A training that is told to end, by Ctrl+C or SIGTERM, in a step."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from magnet import cli
+from tests.toys import ToyData, ToyModel
+
+CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+FIT = ("fit", "--model", "ToyModel", "--model.lr", "1.0", "--data", "ToyData", "--trainer.log_every_n_steps", "1")
+HOW = ("--trainer.max_steps", "6", "--trainer.val_check_interval", "2", "--trainer.num_sanity_val_steps", "0")
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+class Numbered:
+    """Six batches, each full of its number, that go on where they were, as our data sets do."""
+
+    def __init__(self) -> None:
+        self.next = 0
+
+    def __len__(self) -> int:
+        return 6
+
+    def __iter__(self) -> Iterator[Tensor]:
+        while self.next < len(self):
+            self.next += 1
+            yield torch.full((2, 2), self.next - 1.0)
+        self.next = 0
+
+    def state_dict(self) -> dict[str, int]:
+        return {"next": self.next}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.next = state["next"]
+
+
+@pytest.fixture(autouse=True)
+def numbered(toy: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Six batches of which no two are alike; handlers are put back."""
+    monkeypatch.setattr(ToyData, "train_dataloader", lambda self: Numbered())
+    before = {number: signal.getsignal(number) for number in CODES}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def tell(monkeypatch: pytest.MonkeyPatch, number: int, batch: int, times: int = 1) -> list[int]:
+    """Send a signal while the loss of a batch is computed; the batches that are trained on from now on."""
+    seen: list[int] = []
+    plain = ToyModel.training_step
+
+    def training_step(self: ToyModel, rows: Tensor, batch_idx: int) -> Tensor:
+        seen.append(int(rows[0, 0]))
+        if batch_idx == batch and len(seen) <= batch + 1:
+            for _ in range(times):
+                os.kill(os.getpid(), number)
+        return plain(self, rows, batch_idx)
+
+    monkeypatch.setattr(ToyModel, "training_step", training_step)
+    return seen
+
+
+def weights(run: str) -> Tensor:
+    return torch.load(f"{run}/checkpoints/last.ckpt", weights_only=True)["state_dict"]["weight"]
+
+
+def validated(*runs: str) -> list[int]:
+    """Steps after which validation was measured."""
+    found = []
+    for run in runs:
+        with (Path(run) / "metrics.csv").open(newline="") as file:
+            found += [int(row["step"]) for row in csv.DictReader(file) if row.get("val/loss")]
+    return found
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3])
+@pytest.mark.parametrize("number", CODES)
+def test_a_training_that_is_told_to_end_ends_after_the_step_and_goes_on_as_if_it_had_not(
+    number: int, batch: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After batches 1 and 3 a validation is due."""
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "whole"]) == 0
+    seen = tell(monkeypatch, number, batch)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == CODES[number]  # type: ignore[index]
+    assert seen == [*range(batch + 1)]
+    said = capsys.readouterr().err.splitlines()
+    assert "interrupted; the same command with --ckpt_path told/checkpoints/last.ckpt goes on" in said
+    assert sum(line.startswith("stopping after this step") for line in said) == (number == signal.SIGINT)
+    assert cli.main(["fit", "--ckpt_path", "told/checkpoints/last.ckpt", "--out", "on", *HOW, *CPU]) == 0
+    assert seen == [*range(6)]
+    assert torch.equal(weights("on"), weights("whole"))
+    assert validated("whole") == [1, 3, 5]
+    if number == signal.SIGINT:  # who says SIGTERM may not wait for a validation
+        assert validated("told", "on") == [1, 3, 5]
+
+
+def test_a_validation_that_runs_is_finished_first(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    plain = ToyModel.validation_step
+
+    def step(self: ToyModel, rows: Tensor, batch_idx: int) -> None:
+        seen.append(batch_idx)
+        plain(self, rows, batch_idx)
+        if len(seen) == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(ToyModel, "validation_step", step)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 130
+    assert seen == [0, 1]
+    assert validated("told") == [1]
+    assert (toy / "told/checkpoints/best.ckpt").exists()
+
+
+def test_the_second_ctrl_c_stops_at_once(
+    toy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = tell(monkeypatch, signal.SIGINT, 2, times=2)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 1
+    assert seen == [0, 1, 2]
+    assert torch.load("told/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
+    assert "stopping after this step" in capsys.readouterr().err
+
+
+def test_a_training_that_ends_by_itself_leaves_ctrl_c_as_it_was() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "whole"]) == 0
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_where_ctrl_c_is_ignored_it_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    seen = tell(monkeypatch, signal.SIGINT, 2)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "whole"]) == 0
+    assert seen == [*range(6)]
+
+
+@pytest.mark.parametrize("command", ["test", "validate", "predict"])
+def test_other_commands_end_at_once_by_ctrl_c(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "whole"]) == 0
+    seen: list[Any] = []
+
+    def step(self: ToyModel, batch: Tensor, batch_idx: int) -> None:
+        seen.append(signal.getsignal(signal.SIGINT))
+        os.kill(os.getpid(), signal.SIGINT)
+        seen.append("went on")
+
+    name = {"test": "test_step", "validate": "validation_step", "predict": "predict_step"}[command]
+    monkeypatch.setattr(ToyModel, name, step)
+    assert cli.main([command, "--ckpt_path", "whole/checkpoints/last.ckpt", *CPU]) == 1
+    assert seen == [signal.default_int_handler]
