@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from magnet import cli
 from magnet.body import load_body
 from magnet.datamodules.clip import SPLITS
 from magnet.datamodules.fakes.motion import made_up_body, people
@@ -22,6 +23,7 @@ from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.scenes import ScenesReader
+from magnet.export import save_csv
 from magnet.export.npz import save_smplx
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -315,3 +317,18 @@ def test_a_take_with_a_gap_becomes_two_clips(tmp_path: Path) -> None:
     assert [clip.name for clip in clips] == ["walk [0:35]", "walk [37:75]"]
     for clip in clips:
         assert clip.scene.body_rot.isfinite().all() and clip.scene.T_world_root.isfinite().all()
+
+
+def test_a_folder_of_tables_of_joints_is_told_the_way_by_which_it_is_prepared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), load_body()).scene
+    save_csv(made, "dl/a.csv", load_body())
+    for words in (["check", "dl"], ["prepare", "scenes", "--root", "dl", "store"]):
+        assert cli.main(["data", *words]) == 2
+        said = capsys.readouterr().err.split("of tables of joint positions make scenes first, one by one: magnet ")[1]
+        first, then = said.split(" (docs/own.md)")[0].split(", then magnet ")
+    monkeypatch.chdir("dl")
+    assert cli.main(first.split()) == 0 and cli.main([*then.split(), "--workers", "1"]) == 0
+    assert "1 scene" in capsys.readouterr().out

@@ -13,7 +13,16 @@ from typing import ClassVar, Generic, Literal, NamedTuple, Protocol, Self, TypeV
 from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.reading.arrays import hashed_split
 from magnet.datamodules.reading.fields import listing
-from magnet.datamodules.reading.own_files import TABLE, PersonFile, SceneFiles, by_names, by_pattern, by_table, files_of
+from magnet.datamodules.reading.own_files import (
+    TABLE,
+    PersonFile,
+    SceneFiles,
+    by_names,
+    by_pattern,
+    by_table,
+    files_of,
+    of_tables,
+)
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.export.cutting import rates_note
 from magnet.motion.scene import FPS
@@ -99,6 +108,7 @@ class OwnReader(Reader, Generic[T]):
             kinds = " or ".join(self.suffixes)
             raise DataError(
                 f"{self.root}: no {kinds} file; it holds {listing(self.root)}; give the folder that has them"
+                f"{of_tables(self.root)}"
             )
         if pattern is not None:
             by_pattern(self.root, (), pattern)

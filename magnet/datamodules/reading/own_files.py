@@ -73,6 +73,17 @@ def files_of(root: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(found, key=lambda path: (natural(path.relative_to(root).as_posix()), path.as_posix()))
 
 
+def of_tables(root: Path) -> str:
+    """How tables of joint positions under a folder become files that are read, to end an error with; "" of none."""
+    tables = [path for path in files_of(root, (".csv",)) if path.name != TABLE]
+    if not tables:
+        return ""
+    return (
+        f"; of tables of joint positions make scenes first, one by one: magnet export {tables[0].name} "
+        f"scenes/{tables[0].stem}.npz, then magnet data prepare scenes --root scenes store (docs/own.md)"
+    )
+
+
 # -- by names ----------------------------------------------------------------------------------
 
 
