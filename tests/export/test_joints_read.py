@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import magnet
 from magnet import checkpoints, cli
@@ -130,6 +131,23 @@ def test_another_rate_than_that_of_the_times_is_refused(salsa: Scene, body: Body
     assert read(path, options=Reading(in_fps=30)).scene.fps == 30
     with pytest.raises(ValueError, match=r"a\.csv: says 30 frames a second; --in_fps 60 is for files that say nothing"):
         read(path, options=Reading(in_fps=60))
+
+
+@pytest.mark.parametrize(
+    ("twelve", "backwards", "axis"), [(True, False, "x"), (True, True, "y"), (False, False, "z"), (False, True, "x")]
+)
+def test_people_of_a_left_handed_world_look_mirrored_and_others_do_not(
+    twelve: bool, backwards: bool, axis: str, salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    scene = salsa.frames_at(torch.arange(salsa.frames - 1, -1, -1)) if backwards else salsa
+    path = tracked(scene, body, tmp_path / "a.csv", "z") if twelve else save_csv(scene, tmp_path / "a.csv", body)
+    assert "mirrored" not in read(path).notes[0]
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    those = [k for k, name in enumerate(rows[0]) if name.removesuffix("_m").endswith(f"_{axis}")]
+    other = [[str(-float(cell)) if k in those else cell for k, cell in enumerate(row)] for row in rows[1:]]
+    path.write_text("\n".join(",".join(row) for row in [rows[0], *other]) + "\n")
+    said = "knees" if twelve else "knees and toes"
+    assert f"warning: looks mirrored: {said} point backwards; if its world is left-handed" in read(path).notes[0]
 
 
 def test_unknown_joints_can_be_told_and_a_wrong_axis_or_unit_is_doubted(
