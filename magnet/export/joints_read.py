@@ -14,7 +14,7 @@ from magnet.body.base import MOST_SHAPE, Body
 from magnet.body.fit import BodyFit, fit_body
 from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, KNEES, L_ANKLE, L_FOOT, L_HIP, L_KNEE, NECK, SHOULDERS, TOES
 from magnet.export.cutting import kept_frames
-from magnet.export.joints_table import JointTable, read_table
+from magnet.export.joints_table import SLOW, JointTable, read_table
 from magnet.export.naming import recognised
 from magnet.export.npz import require_own_rate
 from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
@@ -53,7 +53,8 @@ def load_joints(
 
     Args:
         unit, up, joints: as `magnet.export.reading.Reading` has them; up is found from where torsos point.
-        fps: the table's frames a second, or of its count of frames, if it says no time; of one frame `FPS`, too.
+        fps: the table's frames a second, or of its count of frames, if it says no time, or too few of them; of one
+            frame `FPS`, too.
         start, end: the frames that are kept, from 0, without `end`; None: to the last.
 
     Raises:
@@ -61,13 +62,7 @@ def load_joints(
         ValueError: as `read_table`, unknown joints, no unit, no rate, another rate than the times', nobody, or no fit.
     """
     path, table = Path(path), read_table(path)
-    rate = table.fps or (fps and fps / table.step)
-    if table.fps:
-        require_own_rate(path, table.fps * table.step, fps)
-    if single := rate is None and len(table.at) == 1:
-        rate = FPS
-    if rate is None:
-        raise ValueError(f"{path}: says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
+    rate, doubts = _rate(path, table, fps)
     if up is not None and up not in UP:
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     found, weight, scheme = _joints(path, table, joints)
@@ -79,16 +74,12 @@ def load_joints(
     for person, there in zip(table.people, valid.T, strict=True):
         if not there.any():
             raise ValueError(f"{path}: {person or 'the person'} has hips and shoulders in no frame")
-    up, doubts = _up(at[valid], used, up)
-    doubts += _mirrored(at[valid], used)
+    up, notes_up = _up(at[valid], used, up)
+    doubts += [*notes_up, *_mirrored(at[valid], used)]
     weights = np.array([weight[j] for j in used]) * np.where(sure, 1.0, BRIDGED * sure.any(axis=0))
     fit = _fitted(path, UNITS[name] * _bridged(at @ UP[up].T, sure), used, weights, valid, rate, body)
     off = float(fit.residual[torch.from_numpy(sure & valid[..., None])].mean())
     head = f"{path.name}: joint positions, {scheme}, {len(used)} joints; unit {name}, {up} up, {rate:g} fps"
-    if table.step > 1:
-        doubts = [f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second", *doubts]
-    if single:
-        doubts = [f"  it has one frame and so no rate: {rate:g} frames a second, unless --in_fps says others", *doubts]
     notes = [head, f"  the body's joints lie {100 * off:.1f} cm from the file's on average", *notes, *doubts]
     if off > POOR_FIT:
         notes.append("  that is much: its proportions are far from a person's; hands and feet may miss")
@@ -97,6 +88,27 @@ def load_joints(
         notes.append(f"  {lack} of {len(valid)} frames lack somebody's hips or shoulders: not valid")
     scene = fit.scene.replace(names=(path.stem,), valid=None if valid.all() else fit.scene.valid)
     return scene, "\n".join(notes), scheme == OURS
+
+
+def _rate(path: Path, table: JointTable, said: float | None) -> tuple[float, list[str]]:
+    """Frames a second of the table's frames, and notes on how that is known."""
+    own = table.fps and table.fps * table.step
+    slow = own is not None and own < SLOW
+    if own is not None and not slow:
+        require_own_rate(path, own, said)
+    notes = [f"  {table.told}"] if table.told else []
+    if slow:
+        notes.append(f"{'  ' if said else WARNING}its times make {own:.3g} frames a second")
+        notes[-1] += f"; {said:g}, as said, are taken" if said else "; if that is wrong, say it with --in_fps"
+    rate = table.fps if own is not None and not (slow and said) else said and said / table.step
+    if rate is None and len(table.at) == 1:
+        return FPS, [*notes, f"  it has one frame and so no rate: {FPS:g} frames a second, unless --in_fps says others"]
+    if rate is None:
+        why = f"{table.told}, and it " if table.told else ""
+        raise ValueError(f"{path}: {why}says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
+    if table.step > 1:
+        notes.append(f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second")
+    return rate, notes
 
 
 def _joints(

@@ -25,6 +25,10 @@ NEAR = 0.3
 """Share of a frame within which times of several people are of one frame."""
 SLOWEST = 1.0
 """Seconds from a frame to the next at most."""
+SLOW, FAST = 10.0, 1000.0
+"""Frames a second of no tracker's, below and above."""
+PARTS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e7: "ticks of 100 ns", 1e9: "nanoseconds"}
+"""What times may be in, by how many of it a second has."""
 MOST_PEOPLE = 200
 """People of a table at most, as in a crowd."""
 
@@ -39,6 +43,7 @@ class JointTable:
     fps: float | None
     unit: str | None
     step: int = 1  # by which the file counts its frames, such as every fifth of a camera's
+    told: str = ""  # how its times were understood, where they are no seconds
 
 
 def read_table(path: str | Path) -> JointTable:
@@ -47,8 +52,8 @@ def read_table(path: str | Path) -> JointTable:
     Columns are named by a joint and an axis, perhaps with a unit (`left_hip_x_m`, `x_left_hip`), and by `frame`,
     `person` and `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames by
     their times, of several people those of one time are one frame; without `time_s`, too, they are frames in order, and
-    the rate is not known. Cells may be empty, and a joint at 0, 0, 0 is missing, too. Where frames or times tell of
-    frames without a row, all joints are missing in them.
+    the rate is not known. Times that go up by ones are numbers of frames. Cells may be empty, and a joint at 0, 0, 0 is
+    missing, too. Where frames or times tell of frames without a row, all joints are missing in them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -67,15 +72,16 @@ def read_table(path: str | Path) -> JointTable:
     if any(place is not None for place in (frame_at, time_at, person_at, scene_at)):  # else it is a frame of nobody
         kept = [k for k, row in enumerate(rows) if any(map(str.strip, row))]
         at_line, rows = [at_line[k] for k in kept], [rows[k] for k in kept]
-    told_in = zip(at_line[1:], rows[1:], strict=True)
-    numbers = np.array([[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in told_in])
+    numbered = zip(at_line[1:], rows[1:], strict=True)
+    numbers = np.array([[_number(path, line, row, k, sign) for k in range(len(head))] for line, row in numbered])
     if scene_at is not None and len(scenes := {row[scene_at].strip() for row in rows[1:]}) > 1:
         raise ValueError(f"{path}: holds {len(scenes)} scenes; keep the rows of one, as magnet export --scene 0 writes")
     told = [""] * len(numbers) if person_at is None else [row[person_at].strip() for row in rows[1:]]
     people = tuple(dict.fromkeys(told))
     if len(people) > MOST_PEOPLE:
         raise ValueError(f"{path}: its column {head[person_at or 0]} names {len(people)} people; is it a row's number?")
-    seconds = None if time_at is None else _seconds(numbers[:, time_at])
+    seconds, told_in = (None, "") if time_at is None else _seconds(numbers, time_at, frame_at, told, head)
+    frame_at = time_at if seconds is None and frame_at is None else frame_at
     frame, step = _frames(path, numbers, frame_at, told, seconds)
     at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     where = np.array(list(columns.values()))
@@ -92,7 +98,7 @@ def read_table(path: str | Path) -> JointTable:
     if (at > MOST_AWAY).any() or (at < -MOST_AWAY).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
     fps = None if seconds is None else _rate(seconds, frame)
-    return JointTable(tuple(columns), people, at, fps, unit, step)
+    return JointTable(tuple(columns), people, at, fps, unit, step, told_in)
 
 
 def _rows(path: Path) -> tuple[str, list[int], list[list[str]]]:
@@ -205,11 +211,31 @@ def _by_time(seconds: Floats, told: Sequence[str]) -> NDArray[np.int64]:
     return np.asarray(frame if alone else frame[np.searchsorted(times, seconds)], np.int64)
 
 
-def _seconds(said: Floats) -> Floats:
-    """Times in seconds: milli-, micro- and nanoseconds are told by frames that would come less than once a second."""
-    times = np.unique(said[np.isfinite(said)])
-    step = float(np.median(np.diff(times))) if len(times) > 2 else 0.0
-    return said / next((unit for unit in (1.0, 1e3, 1e6, 1e9) if step / unit <= SLOWEST), 1.0)
+def _steps(values: Floats, told: Sequence[str]) -> Floats:
+    """From each value of a person to the next. -> (N,), none below 0"""
+    good = np.isfinite(values)
+    whose = np.array(told)
+    return np.concatenate([np.diff(np.sort(values[good & (whose == person)])) for person in set(told)])
+
+
+def _seconds(
+    numbers: Floats, column: int, frames: int | None, told: Sequence[str], head: Sequence[str]
+) -> tuple[Floats | None, str]:
+    """Times in seconds, and a word on what they were understood as, if not that; None: they are numbers of frames.
+
+    Smaller parts of a second are told by the frames a second that they make, those that a column counts.
+    """
+    said = numbers[:, column]
+    good, steps = said[np.isfinite(said)], _steps(said, told)
+    counted = np.ones(1) if frames is None else _steps(numbers[:, frames], told)
+    usual = max(float(np.median(counted[counted > 0])), 1.0) if (counted > 0).any() else 1.0
+    step = float(np.median(steps[steps > 0])) / usual if len(np.unique(good)) > 2 else 0.0
+    if step * usual == 1 and (steps > 0).all() and (good == np.round(good)).all():
+        return (None, f"its column {head[column]} counts frames") if usual < SLOW else (said, "")
+    likely = [parts for parts in PARTS if SLOW <= parts / step <= FAST] if step else []
+    likely += [parts for parts in PARTS if step / parts <= SLOWEST]
+    parts = [*likely, 1.0][0]
+    return said / parts, "" if parts == 1 else f"its times are taken as {PARTS[parts]}"
 
 
 def _rate(seconds: Floats, frame: NDArray[np.int64]) -> float | None:

@@ -133,6 +133,29 @@ def test_another_rate_than_that_of_the_times_is_refused(salsa: Scene, body: Body
         read(path, options=Reading(in_fps=60))
 
 
+def test_few_frames_a_second_are_doubted_and_what_is_said_counts_instead(
+    salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    path = tracked(salsa.replace(fps=4.0), body, tmp_path / "a.csv")
+    assert "warning: its times make 4 frames a second" in read(path).notes[0]
+    told = read(path, options=Reading(in_fps=30, keep_floor=True))
+    assert told.scene.fps == 30 and off(told.scene, salsa, body) < 0.02 and "warning" not in told.notes[0]
+    assert "its times make 4 frames a second; 30, as said, are taken" in told.notes[0]
+    path = counted(tracked(salsa, body, tmp_path / "b.csv"))
+    with pytest.raises(
+        ValueError, match=r"b\.csv: its column time_s counts frames, and it says no time; say its frames"
+    ):
+        read(path)
+    assert off(read(path, options=Reading(in_fps=30, keep_floor=True)).scene, salsa, body) < 0.02
+
+
+def counted(path: Path) -> Path:
+    """The same table, whose times are numbers of frames."""
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    path.write_text("\n".join(",".join([row[1] if not n else row[0], *row[2:]]) for n, row in enumerate(rows)) + "\n")
+    return path
+
+
 @pytest.mark.parametrize(
     ("twelve", "backwards", "axis"), [(True, False, "x"), (True, True, "y"), (False, False, "z"), (False, True, "x")]
 )

@@ -92,10 +92,27 @@ def test_without_frames_rows_of_one_time_are_of_one_frame(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("start", [0, 1_700_000_000])
-@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
+@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**7, 10**9])
 def test_times_may_be_in_smaller_units_and_count_from_long_ago(unit: int, start: int, tmp_path: Path) -> None:
     rows = [f"{unit * start + unit * t // 25 if unit > 1 else start + t / 25},{t},1,2,3" for t in range(50)]
     assert read_table(table(tmp_path / "a.csv", "timestamp,frame,a_x,a_y,a_z", *rows)).fps == 25.0
+
+
+@pytest.mark.parametrize("people", [1, 2])
+def test_times_that_go_up_by_ones_are_numbers_of_frames(people: int, tmp_path: Path) -> None:
+    rows = [f"{t},{who},{t},2,3" for t in (7, 8, 9, 11) for who in "AB"[:people]]
+    found = read_table(table(tmp_path / "a.csv", "t,person,a_x,a_y,a_z", *rows))
+    assert found.fps is None and found.told == "its column t counts frames"
+    assert found.at[:, -1, 0, 0].tolist()[:3] == [7, 8, 9] and np.isnan(found.at[3]).all() and len(found.at) == 5
+    rows = [f"{30 * t},{t},1,2,3" for t in range(4)]  # each second one of a film of 30 a second
+    found = read_table(table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *rows))
+    assert (found.fps, found.step, found.told) == (1.0, 30, "")
+
+
+def test_frames_that_are_counted_in_steps_tell_the_unit_of_times(tmp_path: Path) -> None:
+    rows = [f"{5 * t},{200_000 * t},1,2,3" for t in range(9)]  # of ticks they would be 250 a second
+    found = read_table(table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *rows))
+    assert found.fps == 5.0 and found.told == "its times are taken as microseconds"
 
 
 def test_a_joint_at_zero_is_missing(tmp_path: Path) -> None:
