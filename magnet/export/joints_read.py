@@ -75,7 +75,7 @@ def load_joints(
         if not there.any():
             raise ValueError(f"{path}: {person or 'the person'} has hips and shoulders in no frame")
     up, notes_up = _up(at[valid], used, up)
-    doubts += [*notes_up, *_mirrored(at[valid], used)]
+    doubts += [*notes_up, *_untracked(table.people, used, sure), *_mirrored(at[valid], used)]
     weights = np.array([weight[j] for j in used]) * np.where(sure, 1.0, BRIDGED * sure.any(axis=0))
     fit = _fitted(path, UNITS[name] * _bridged(at @ UP[up].T, sure), used, weights, valid, rate, body)
     off = float(fit.residual[torch.from_numpy(sure & valid[..., None])].mean())
@@ -109,6 +109,17 @@ def _rate(path: Path, table: JointTable, said: float | None) -> tuple[float, lis
     if table.step > 1:
         notes.append(f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second")
     return rate, notes
+
+
+def _untracked(people: Sequence[str], used: Sequence[int], sure: Bools) -> list[str]:
+    """A warning for each person of whom joints are missing in all frames. sure (T, P, M)"""
+    found = []
+    for person, ever in zip(people, np.asarray(sure.any(axis=0)), strict=True):
+        if not ever.all():
+            names = ", ".join(JOINT_NAMES[j] for j, once in zip(used, ever.tolist(), strict=True) if not once)
+            whose = f" of {person}" if person else ""
+            found.append(f"{WARNING}{names}{whose}: in no frame; made up of the body at rest")
+    return found
 
 
 def _joints(

@@ -156,6 +156,12 @@ def counted(path: Path) -> Path:
     return path
 
 
+def test_joints_that_are_in_no_frame_are_named(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    lost = [(t, 1, name) for t in range(salsa.frames) for name in ("left_ankle", "right_wrist")]
+    got = read(tracked(salsa, body, tmp_path / "a.csv", lost=lost))
+    assert "warning: left_ankle, right_wrist of B: in no frame; made up of the body at rest" in got.notes[0]
+
+
 @pytest.mark.parametrize(
     ("twelve", "backwards", "axis"), [(True, False, "x"), (True, True, "y"), (False, False, "z"), (False, True, "x")]
 )
