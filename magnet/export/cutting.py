@@ -1,9 +1,12 @@
-"""A part of a file's frames, which `--start` and `--end` choose, and files of several frame rates."""
+"""A part of a file's frames, which `--start` and `--end` choose, and files of several clocks or frame rates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 
 def kept_frames(path: Path, frames: int, start: int, end: int | None) -> slice:
@@ -33,6 +36,55 @@ def require_one_clock(paths: Sequence[Path], rates: Sequence[float], start: int,
     if (start or end is not None) and len(set(rates)) > 1:
         each = ", ".join(f"{path} {rate:g} fps" for path, rate in zip(paths, rates, strict=True))
         raise ValueError(f"frame rates differ: {each}; --start and --end count frames, so cut each with magnet export")
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Where a file's first frame is on the clocks that it tells."""
+
+    frame: float | None  # as the file counts frames
+    second: float | None
+    count: float  # frames a second of that count
+
+
+def shared_frames(
+    paths: Sequence[Path], frames: Sequence[int], rates: Sequence[float], begins: Sequence[Begin]
+) -> tuple[list[slice], list[str]]:
+    """The frames of each file that are of the moments of all, and a note if any is cut.
+
+    Clocks on which all begin at once tell nothing: each file's may have been set to 0.
+
+    Raises:
+        ValueError: there is no such moment.
+    """
+    clocks: dict[str, list[float]] = {}
+    counted = [begin.frame / begin.count for begin in begins if begin.frame is not None]
+    if len(counted) == len(begins) and len({begin.count for begin in begins}) == 1:
+        clocks["frame numbers"] = counted
+    timed = [begin.second for begin in begins if begin.second is not None]
+    if len(timed) == len(begins):
+        clocks["times"] = timed
+    apart = [what for what, starts in clocks.items() if np.ptp(starts) > 0.5 / max(rates)]
+    if not apart:
+        return [slice(None)] * len(paths), []
+    starts, each = clocks[apart[0]], list(zip(frames, rates, strict=True))
+    late = [round((max(starts) - start) * rate) for start, rate in zip(starts, rates, strict=True)]
+    lasts = min((many - begin) / rate for (many, rate), begin in zip(each, late, strict=True))
+    if lasts <= 0:
+        said = ", ".join(
+            f"{path} from {start - min(starts):.6g} to {start - min(starts) + many / rate:.6g} s"
+            for path, start, (many, rate) in zip(paths, starts, each, strict=True)
+        )
+        raise ValueError(
+            f"by their {apart[0]} files share no moment: {said}; people of one scene are of one clock: where these "
+            "are not, leave out the columns that count frames and time, and say the rate with --in_fps"
+        )
+    kept = [
+        slice(begin, min(begin + max(round(lasts * rate), 1), many))
+        for (many, rate), begin in zip(each, late, strict=True)
+    ]
+    begun = f"by their {apart[0]} files begin up to {np.ptp(starts):.3g} s apart"
+    return kept, [f"{begun}: each was cut to the {lasts:.3g} s of all"]
 
 
 def rates_note(rates: Sequence[float], fps: float) -> list[str]:

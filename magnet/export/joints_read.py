@@ -13,7 +13,7 @@ from torch import Tensor
 from magnet.body.base import MOST_SHAPE, Body
 from magnet.body.fit import BodyFit, fit_body
 from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, KNEES, L_ANKLE, L_FOOT, L_HIP, L_KNEE, NECK, SHOULDERS, TOES
-from magnet.export.cutting import kept_frames
+from magnet.export.cutting import Begin, kept_frames
 from magnet.export.joints_table import SLOW, JointTable, read_table
 from magnet.export.naming import recognised
 from magnet.export.npz import require_own_rate
@@ -46,8 +46,9 @@ def load_joints(
     fps: float | None = None,
     start: int = 0,
     end: int | None = None,
-) -> tuple[Scene, str, bool]:
-    """The people of a table on a body, fitted to their joints; a note on how it was read; whether it is one of ours.
+) -> tuple[Scene, str, bool, Begin]:
+    """The people of a table on a body, fitted to their joints; a note on how it was read; whether it is one of ours;
+    and when it begins.
 
     Frames in which somebody's hips or shoulders are missing are not valid; other joints may be missing now and then.
 
@@ -67,7 +68,8 @@ def load_joints(
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     found, weight, scheme = _joints(path, table, joints)
     used = sorted(weight)
-    at = table.at[kept_frames(path, len(table.at), start, end)][:, :, [found[j] for j in used]]
+    kept = kept_frames(path, len(table.at), start, end)
+    at = table.at[kept][:, :, [found[j] for j in used]]
     name, notes = _unit(path, at, used, unit or table.unit)
     sure = np.asarray(np.isfinite(at).all(axis=-1))  # (T, P, M)
     valid = np.asarray(sure[:, :, [used.index(j) for j in (*HIPS, *SHOULDERS)]].all(axis=-1))
@@ -87,7 +89,11 @@ def load_joints(
         lack = int(np.count_nonzero(~valid.all(axis=1)))
         notes.append(f"  {lack} of {len(valid)} frames lack somebody's hips or shoulders: not valid")
     scene = fit.scene.replace(names=(path.stem,), valid=None if valid.all() else fit.scene.valid)
-    return scene, "\n".join(notes), scheme == OURS
+    count = rate * table.step
+    own = (table.fps or rate) * table.step  # by its times
+    first = None if table.first is None else table.first + kept.start * table.step
+    second = None if table.second is None else table.second * own / count + kept.start / rate
+    return scene, "\n".join(notes), scheme == OURS, Begin(first, second, count)
 
 
 def _rate(path: Path, table: JointTable, said: float | None) -> tuple[float, list[str]]:

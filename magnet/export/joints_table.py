@@ -43,6 +43,8 @@ class JointTable:
     fps: float | None
     unit: str | None
     step: int = 1  # by which the file counts its frames, such as every fifth of a camera's
+    first: int | None = None  # the first frame, as the file counts
+    second: float | None = None  # the first frame's time
     told: str = ""  # how its times were understood, where they are no seconds
 
 
@@ -98,7 +100,9 @@ def read_table(path: str | Path) -> JointTable:
     if (at > MOST_AWAY).any() or (at < -MOST_AWAY).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
     fps = None if seconds is None else _rate(seconds, frame)
-    return JointTable(tuple(columns), people, at, fps, unit, step, told_in)
+    first = None if frame_at is None else int(numbers[:, frame_at].min())
+    second = None if seconds is None else _first_time(seconds, frame, fps)
+    return JointTable(tuple(columns), people, at, fps, unit, step, first, second, told_in)
 
 
 def _rows(path: Path) -> tuple[str, list[int], list[list[str]]]:
@@ -236,6 +240,15 @@ def _seconds(
     likely += [parts for parts in PARTS if step / parts <= SLOWEST]
     parts = [*likely, 1.0][0]
     return said / parts, "" if parts == 1 else f"its times are taken as {PARTS[parts]}"
+
+
+def _first_time(seconds: Floats, frame: NDArray[np.int64], fps: float | None) -> float | None:
+    """The time of the first frame, by the first row that says one."""
+    good = np.nonzero(np.isfinite(seconds))[0]
+    if not len(good):
+        return None
+    row = good[frame[good].argmin()]
+    return float(seconds[row] - (frame[row] / fps if fps else 0.0))
 
 
 def _rate(seconds: Floats, frame: NDArray[np.int64]) -> float | None:

@@ -10,7 +10,7 @@ from typing import Any
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.checks import require_flag, require_number, require_whole
-from magnet.export.cutting import rates_note
+from magnet.export.cutting import rates_note, shared_frames
 from magnet.export.formats import MOST_FPS, WRITTEN
 from magnet.export.gltf_file import GLTF
 from magnet.export.joints_read import load_joints
@@ -149,10 +149,13 @@ def _from_tables(files: Sequence[Path], body: Body, options: Reading) -> Read:
     how: dict[str, Any] = {"unit": options.unit, "up": options.up, "joints": options.joints, "fps": options.in_fps}
     how |= {"start": options.start, "end": options.end}
     read_so = [load_joints(file, body, **how) for file in files]
-    scenes, notes = [scene for scene, *_ in read_so], [note for _, note, _ in read_so]
-    scene = together(scenes, [str(file) for file in files], fps=options.fps, trim=options.trim)
-    notes += rates_note([one.fps for one in scenes], scene.fps)
-    return _grounded(scene, body, notes, () if options.keep_floor else [not ours for *_, ours in read_so])
+    scenes, notes = [scene for scene, *_ in read_so], [note for _, note, *_ in read_so]
+    rates = [scene.fps for scene in scenes]
+    parts, cut = shared_frames(files, [scene.frames for scene in scenes], rates, [begin for *_, begin in read_so])
+    scenes = [scene.slice(part.start or 0, part.stop) for scene, part in zip(scenes, parts, strict=True)]
+    scene = together(scenes, [str(file) for file in files], fps=options.fps, trim=options.trim or bool(cut))
+    notes += [*cut, *rates_note(rates, scene.fps)]
+    return _grounded(scene, body, notes, () if options.keep_floor else [not ours for _, _, ours, _ in read_so])
 
 
 def shared(options: Reading, *groups: Sequence[str | Path]) -> list[Reading]:

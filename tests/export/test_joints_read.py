@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -177,6 +178,45 @@ def test_people_of_a_left_handed_world_look_mirrored_and_others_do_not(
     path.write_text("\n".join(",".join(row) for row in [rows[0], *other]) + "\n")
     said = "knees" if twelve else "knees and toes"
     assert f"warning: looks mirrored: {said} point backwards; if its world is left-handed" in read(path).notes[0]
+
+
+def one_each(scene: Scene, body: Body, folder: Path, later: int, columns: str, by: int = 0) -> list[Path]:
+    """A table of each of two people, with these columns. The second lacks the first `later` frames, the first
+    half as many at the end, and the second's clock is `by` frames ahead."""
+    paths = []
+    for p in range(2):
+        path = tracked(scene.people().select([p]), body, folder / f"{p}.csv")
+        head, *rows = (line.split(",") for line in path.read_text().splitlines())
+        kept = [k for k, name in enumerate(head) if name not in {"frame", "time_s", "person"} - set(columns.split())]
+        for row in rows if p else []:
+            row[:2] = str(int(row[0]) + by), str(float(row[1]) + by / scene.fps)
+        rows = [head, *(rows[later:] if p else rows[: len(rows) - later // 2])]
+        path.write_text("\n".join(",".join(row[k] for k in kept) for row in rows) + "\n")
+        paths.append(path)
+    return paths
+
+
+@pytest.mark.parametrize(("columns", "trim"), [("frame", True), ("time_s", False), ("frame time_s", False)])
+def test_files_of_one_clock_are_cut_to_the_moments_that_they_share(
+    columns: str, trim: bool, salsa: Scene, body: Body, tmp_path: Path
+) -> None:
+    options = Reading(trim=trim, keep_floor=True, in_fps=30)
+    got = read(one_each(salsa, body, tmp_path, 20, columns), options=options)
+    assert got.scene.frames == 34 and off(got.scene, salsa.slice(20, 54), body) < 0.02
+    what = "frame numbers" if "frame" in columns else "times"
+    assert f"by their {what} files begin up to 0.667 s apart: each was cut to the 1.13 s of all" in got.notes
+    part = read(one_each(salsa, body, tmp_path, 20, columns), options=replace(options, start=2, end=30))
+    assert off(part.scene, salsa.slice(22, 30), body) < 0.02
+    with pytest.raises(ValueError, match=rf"by their {what} files share no moment: .*0\.csv from 0 to 2\.13333 s, "):
+        read(one_each(salsa, body, tmp_path, 0, columns, by=100), options=options)
+
+
+def test_files_that_begin_together_or_tell_no_moment_are_as_they_were(salsa: Scene, body: Body, tmp_path: Path) -> None:
+    options = Reading(keep_floor=True, in_fps=30)
+    got = read(one_each(salsa, body, tmp_path, 0, "frame"), options=options)
+    assert off(got.scene, salsa, body) < 0.02 and not any("apart" in note for note in got.notes)
+    with pytest.raises(ValueError, match=r"lengths differ: .* cut all to the shortest with --trim"):
+        read(one_each(salsa, body, tmp_path, 20, ""), options=options)
 
 
 def test_unknown_joints_can_be_told_and_a_wrong_axis_or_unit_is_doubted(

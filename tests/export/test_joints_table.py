@@ -102,7 +102,7 @@ def test_times_may_be_in_smaller_units_and_count_from_long_ago(unit: int, start:
 def test_times_that_go_up_by_ones_are_numbers_of_frames(people: int, tmp_path: Path) -> None:
     rows = [f"{t},{who},{t},2,3" for t in (7, 8, 9, 11) for who in "AB"[:people]]
     found = read_table(table(tmp_path / "a.csv", "t,person,a_x,a_y,a_z", *rows))
-    assert found.fps is None and found.told == "its column t counts frames"
+    assert found.fps is None and found.told == "its column t counts frames" and found.first == 7
     assert found.at[:, -1, 0, 0].tolist()[:3] == [7, 8, 9] and np.isnan(found.at[3]).all() and len(found.at) == 5
     rows = [f"{30 * t},{t},1,2,3" for t in range(4)]  # each second one of a film of 30 a second
     found = read_table(table(tmp_path / "a.csv", "frame,time,a_x,a_y,a_z", *rows))
