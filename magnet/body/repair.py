@@ -83,7 +83,8 @@ def repaired(
     falling floats.
 
     Args:
-        scene: (B, T, P); above 45 fps corrections are computed for about 30 frames a second.
+        scene: (B, T, P); above 45 fps corrections are computed for about 30 frames a second, and again by those between
+            where people stay deep in each other.
         body: the body of its shape numbers.
         how: `light` or `firm`, see `CONTACT`; or `hold`: as `firm`, and hands that met go on holding
             (`magnet.body.holding.lasting_holds`).
@@ -99,20 +100,58 @@ def repaired(
     if scene.valid is not None and not bool(scene.valid.all()):
         repair = partial(repaired, body=body, how=how, settle=settle, slides=slides, drifting=drifting)
         return _by_stretches(scene, fixed, begun, repair)
-    every = max(round(scene.fps / FPS), 1)
     if drifting:
         scene = undrifted(unjumped(grounded(scene, body, fixed), body, fixed), body, fixed, slides)
-    few = torch.arange(0, scene.frames, every, device=scene.device)
-    seen = scene.frames_at(few).replace(fps=scene.fps / every)
-    stay = fixed_in(fixed, few)
-    offset = settling(seen, body, how, stay, settle, begun, slides=slides)
-    if settle is None:
-        offset = pressed(seen, body, offset, how, stay, begun, slides)
-    if every > 1:
-        offset = between_frames(offset, few, scene.frames)
-    if fixed is not None:
-        offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
-    return corrected(scene, offset)
+    every = max(round(scene.fps / FPS), 1)
+
+    def by(scene: Scene, first: int, fixed: Tensor | None) -> Scene:
+        """Corrected by every so-many-th frame, from `first` on."""
+        few = torch.arange(first, scene.frames, every, device=scene.device)
+        seen, stay = scene.frames_at(few).replace(fps=scene.fps / every), fixed_in(fixed, few)
+        offset = settling(seen, body, how, stay, settle, begun, slides=slides)
+        if settle is None:
+            offset = pressed(seen, body, offset, how, stay, begun, slides)
+        if every > 1:
+            offset = between_frames(offset, few, scene.frames)
+        if fixed is not None:
+            offset = torch.where(fixed.to(offset.device)[..., None], 0.0, offset)
+        return corrected(scene, offset)
+
+    made = by(scene, 0, fixed)
+    return made if every == 1 or settle is not None else _between(made, body, how, fixed, every, by)
+
+
+def _between(
+    scene: Scene,
+    body: Body,
+    how: str,
+    fixed: Tensor | None,
+    every: int,
+    by: Callable[[Scene, int, Tensor | None], Scene],
+) -> Scene:
+    """A corrected scene, corrected again by frames between those that were seen, as long as people stay deep in these.
+
+    Arms that swing through each other between two frames that were seen are in neither. A scene in which that does not
+    help keeps its own.
+    """
+    seen = torch.zeros(every, dtype=torch.bool, device=scene.device)
+    seen[0] = True
+    group = torch.arange(scene.frames, device=scene.device) % every
+    for _ in range(every - 1):
+        depth = depth_between(scene, body, fixed)
+        between = torch.where(seen[group], 0.0, depth)
+        deep = (between.amax(dim=1) > CONTACT[FIRM.get(how, how)].measured + STAYS).nonzero()[:, 0]
+        if not len(deep):
+            break
+        first = int(group[between.amax(dim=0).argmax()])
+        seen[first] = True
+        still = fixed_of(None if fixed is None else fixed.to(deep.device), deep, scene.scenes)
+        again = by(scene.select(deep), first, still)
+        better = depth_between(again, body, still).amax(dim=1) < depth[deep].amax(dim=1)
+        T_world_root, body_rot = scene.T_world_root.clone(), scene.body_rot.clone()
+        T_world_root[deep[better]], body_rot[deep[better]] = again.T_world_root[better], again.body_rot[better]
+        scene = scene.replace(T_world_root=T_world_root, body_rot=body_rot)
+    return scene
 
 
 def pressed(
@@ -234,10 +273,11 @@ def between_frames(offset: Tensor, few: Tensor, frames: int) -> Tensor:
     """Corrections of evenly spaced frames interpolated to all frames, cubic. (B, F, P, D) -> (B, T, P, D)"""
     if len(few) < 2:
         return offset.expand(-1, frames, -1, -1)
-    last = int(few[-1])
+    first, last = int(few[0]), int(few[-1])
     flat = offset.flatten(2).transpose(1, 2)[..., None]  # (B, P D, F, 1)
-    smooth = F.interpolate(flat, (last + 1, 1), mode="bicubic", align_corners=True)[..., 0].transpose(1, 2)
-    whole = torch.cat([smooth, smooth[:, -1:].expand(-1, frames - last - 1, -1)], dim=1)
+    smooth = F.interpolate(flat, (last + 1 - first, 1), mode="bicubic", align_corners=True)[..., 0].transpose(1, 2)
+    begin, end = smooth[:, :1].expand(-1, first, -1), smooth[:, -1:].expand(-1, frames - last - 1, -1)
+    whole = torch.cat([begin, smooth, end], dim=1)
     return whole.unflatten(2, offset.shape[2:])
 
 

@@ -288,3 +288,14 @@ def test_depth_that_a_correction_leaves_for_a_moment_is_corrected_again_around_i
 def test_where_nothing_stays_deep_a_scene_is_corrected_once(handshake: Scene) -> None:
     once = repaired(handshake, BODY, settle=Settle())
     assert torch.equal(repaired(handshake, BODY).body_rot, once.body_rot)
+
+
+def test_limbs_that_cross_between_the_frames_that_are_corrected_are_corrected_too() -> None:
+    scene = swinging(100).replace(fps=120.0)
+    assert float(depths(scene).max()) > 0.08 and not depths(scene)[::4].any()
+    made = repaired(scene, BODY)
+    assert float(depths(made).max()) < 0.05
+    kept = repaired(scene, BODY, fixed=torch.tensor([True, False]))
+    assert float(depths(kept).max()) < 0.05
+    assert torch.equal(kept.body_rot[:, :, 0], scene.body_rot[:, :, 0])
+    assert torch.equal(kept.T_world_root[:, :, 0], scene.T_world_root[:, :, 0])
