@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field, require_finite
-from magnet.generation.expected import of_itself
-from magnet.generation.settling import PACE, Corrected, settled_on
+from magnet.generation.expected import Ahead, of_itself
+from magnet.generation.settling import PACE, Corrected, Later, settled_on
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -49,7 +49,7 @@ class World(Protocol):
     there: Tensor
     released: int
     decoder: Carried
-    decoder_of_others: dict[int, Carried]
+    decoder_of_others: dict[tuple[int, bool], Carried]
 
     @property
     def settle(self) -> str | None: ...
@@ -58,7 +58,7 @@ class World(Protocol):
 
 
 @torch.inference_mode()
-def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: tuple[Tensor, Tensor] | None) -> None:
+def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected: Ahead | None) -> None:
     """Decode the bodies of the token steps up to `stop`; they are given from then on.
 
     Args:
@@ -69,7 +69,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
         expected: what is expected from `near` on, see `magnet.generation.expected`.
     """
     frames = slice(world.finalized * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-    behind = near - stop + (0 if expected is None else expected[0].shape[2])
+    behind = near - stop + (0 if expected is None else expected.tokens.shape[2])
     more = 0 if world.settle is None else min(EXPECTED, behind)
     made = decode_bodies(world, tokens, world.finalized, stop, near, expected, more)
     if world.settle is not None:
@@ -79,9 +79,7 @@ def finalize_bodies(world: World, tokens: Tensor, stop: int, near: int, expected
     world.finalized = stop
 
 
-def _settled(
-    world: World, made: Scene, stop: int, how: str, tokens: Tensor, expected: tuple[Tensor, Tensor] | None
-) -> Scene:
+def _settled(world: World, made: Scene, stop: int, how: str, tokens: Tensor, expected: Ahead | None) -> Scene:
     """Bodies of the token steps up to `stop` corrected, each person's by what was final of others before, or shown.
 
     Frames of `made` after them are what the corrections will have to go on to; they are not returned. They are those of
@@ -90,50 +88,78 @@ def _settled(
     first, own = world.finalized * TOKEN_FRAMES, (stop - world.finalized) * TOKEN_FRAMES
     rows = slice(world.finalized, stop)
     new = world.rows_by_frame(world.placed[rows] & ~world.known[rows])
-    after = new[-1:] if expected is None else new[-1:] & expected[1].to(new.device)
+    after = new[-1:] if expected is None else new[-1:] & expected.told.to(new.device)
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     seen = 1 + PACE if world.correction is not None else RECALLED
     before = world.given.slice(max(first - seen, 0), first) if first else None
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     sees = (world.saw & world.placed[rows].all(dim=0)).to(new.device)
-
-    def later(one: int, others: Tensor, shown: Scene) -> Scene | None:
-        if expected is None or not bool(expected[1][one]):
-            return None
-        after = made.frames // TOKEN_FRAMES - (stop - world.finalized)
-        return others_expected(world, tokens, stop, after, expected[0][:, one], one, others, shown)
-
+    later = None if expected is None else expectation(world, tokens, stop, made.frames // TOKEN_FRAMES, expected)
     corrected, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected, later)
     world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
     return corrected.slice(0, own)
 
 
-def others_expected(
-    world: World, tokens: Tensor, stop: int, after: int, expected: Tensor, one: int, others: Tensor, shown: Scene
-) -> Scene:
-    """Frames after a block as somebody expects others to go on in them from where they are. -> (B, 4 after, P)
+def expectation(world: World, tokens: Tensor, stop: int, rows: int, expected: Ahead) -> Later:
+    """How people expect others to go on after a block or, where they do not see it, in it.
 
     Args:
-        world: in which the tokens up to `stop` are placed.
+        world: of which all token steps before the block are finalized.
         tokens: (B, N, P, D), of which those up to `stop` are read.
         stop: one past the block's last token step.
-        after: token steps after it, at most n.
-        expected: (B, n, P, D) the tokens of everybody from `stop` on that are expected.
-        one: who expects them.
-        others: (p,) int, of whom something is wanted; frames of the rest mean nothing.
-        shown: (B, LEAD, P) the last frames of the block.
+        rows: token steps of the block and after it that are wanted.
+        expected: what is expected from `stop` on.
     """
-    model, low = world.model, max(stop - receptive_field(world.model)[0], 0)
-    latent, deltas, _ = model.parts_of(tokens[:, low:stop])
+    begins = world.finalized
+    block = stop - begins
+
+    def later(one: int, others: Tensor, shown: Scene, hidden: bool) -> Scene | None:
+        if not bool(expected.told[one]):
+            return None
+        ahead = expected.tokens[:, one]
+        if not hidden:
+            return others_expected(world, tokens, stop, rows - block, ahead, (one, False), others, shown)
+        if expected.within.shape[2] != block or not bool(world.placed[begins - 1, others.cpu()].all()):
+            return None
+        ahead = torch.cat([expected.within[:, one], ahead], dim=1)
+        return others_expected(world, tokens, begins, rows, ahead, (one, True), others, shown)
+
+    return later
+
+
+def others_expected(
+    world: World,
+    tokens: Tensor,
+    start: int,
+    after: int,
+    expected: Tensor,
+    who: tuple[int, bool],
+    others: Tensor,
+    shown: Scene,
+) -> Scene:
+    """Frames as somebody expects others to go on in them from where they are. -> (B, 4 after, P)
+
+    Args:
+        world: in which the tokens up to `start` are placed.
+        tokens: (B, N, P, D), of which those up to `start` are read.
+        start: the first token step that is expected.
+        after: token steps from there, at most n.
+        expected: (B, n, P, D) the tokens of everybody from `start` on that are expected.
+        who: expects them, and whether others are hidden: what the decoder carries is of the same call each time.
+        others: (p,) int, of whom something is wanted; frames of the rest mean nothing.
+        shown: (B, LEAD, P) the last frames before `start`.
+    """
+    model, low = world.model, max(start - receptive_field(world.model)[0], 0)
+    latent, deltas, _ = model.parts_of(tokens[:, low:start])
     later, ways, _ = model.parts_of(expected)
     ways = to_9d(project_se2(from_9d(ways)))
-    frames = slice(stop * TOKEN_FRAMES - LEAD, (stop + after) * TOKEN_FRAMES)
+    frames = slice(start * TOKEN_FRAMES - LEAD, (start + after) * TOKEN_FRAMES)
     wanted = slice(frames.start - low * TOKEN_FRAMES, frames.stop - low * TOKEN_FRAMES)
     parts = torch.cat([latent, later], dim=1), torch.cat([deltas, ways], dim=1)
-    carried = world.decoder_of_others.setdefault(one, Carried(world.decoder.keep))
-    features = decoded_frames(world, *parts, wanted, low, stop - low, others, carried)
+    carried = world.decoder_of_others.setdefault(who, Carried(world.decoder.keep))
+    features = decoded_frames(world, *parts, wanted, low, start - low, others, carried)
     # Not averaged: of who is given and who is made alike, so that agents by themselves expect what one process does.
-    T_world_can = path_on(world.T_world_can[:, : stop * TOKEN_FRAMES], ways, frames.stop)[:, frames]
+    T_world_can = path_on(world.T_world_can[:, : start * TOKEN_FRAMES], ways, frames.stop)[:, frames]
     given = shown.frames_at(torch.arange(frames.stop - frames.start).clamp(max=LEAD - 1))
     keep = torch.arange(given.frames)[:, None].expand(-1, given.agents) < LEAD
     made = posed(features, T_world_can, given)
@@ -174,7 +200,7 @@ def decode_bodies(
     first: int,
     stop: int,
     near: int,
-    expected: tuple[Tensor, Tensor] | None = None,
+    expected: Ahead | None = None,
     more: int = 0,
 ) -> Scene:
     """Token steps [first, stop) decoded from the tokens before `near` alone, continuing from finalized bodies.
@@ -263,11 +289,9 @@ def decoded_frames(
     return whole
 
 
-def continuation(
-    world: World, latent: Tensor, deltas: Tensor, expected: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
+def continuation(world: World, latent: Tensor, deltas: Tensor, expected: Ahead) -> tuple[Tensor, Tensor]:
     """Latents and deltas to decode after the last ones. Agents of whom nothing is expected repeat their last token."""
-    tokens, told = of_itself(expected[0]), expected[1].to(latent.device)
+    tokens, told = of_itself(expected.tokens), expected.told.to(latent.device)
     later, ways, _ = world.model.parts_of(tokens)
     ways = to_9d(project_se2(from_9d(ways)))
     later = torch.where(told[:, None], later, latent[:, -1:])

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from magnet.sampling.schedule import Stage
+
+
+class Ahead(NamedTuple):
+    """Tokens that each agent expects of everybody; [:, p, :, q] are those of agent q as p expects them."""
+
+    tokens: Tensor  # (B, P, n, P, D) after a block
+    told: Tensor  # (P,) bool, who expects any
+    within: Tensor  # (B, P, m, P, D) of the block, where q is not seen in it
 
 
 class Expected:
@@ -21,7 +31,7 @@ class Expected:
 
     def __init__(self, most: int) -> None:
         self.most = most
-        self.row = -1
+        self.row = self.first = -1
         self._tokens: Tensor | None = None
         self._told = torch.zeros(0, dtype=torch.bool)
 
@@ -35,25 +45,23 @@ class Expected:
             clean: (B, V, W + ahead, P, D) what each view predicts.
             view_of: (P,) int, the view of each agent.
         """
-        row = stage.active[1]
-        behind = clean[:, :, row - stage.start :][:, :, : self.most]
+        first, row = stage.active
+        behind = clean[:, :, first - stage.start :][:, :, : row - first + self.most]
         behind = behind[:, view_of.to(behind.device)]
-        if row != self.row:
-            self.row, self._tokens = row, behind.clone()
+        if (first, row) != (self.first, self.row):
+            self.first, self.row, self._tokens = first, row, behind.clone()
             self._told = torch.zeros(clean.shape[3], dtype=torch.bool)
         new = (stage.levels[-1, row - 1 - stage.start] == 0) & ~self._told
         if self._tokens is not None and self._tokens.shape == behind.shape:
             self._tokens[:, new] = behind[:, new]
             self._told |= new
 
-    def behind(self, row: int) -> tuple[Tensor, Tensor] | None:
-        """Tokens (B, P, n, P, D) predicted from a token step on, and by whom (P,) bool; None: there are none.
-
-        [:, p, :, q] are those of agent q as p expects them.
-        """
-        if row != self.row or self._tokens is None or not self._tokens.shape[2] or not bool(self._told.any()):
+    def behind(self, row: int) -> Ahead | None:
+        """What is expected from a token step on; None: nothing."""
+        if row != self.row or self._tokens is None or not bool(self._told.any()):
             return None
-        return self._tokens, self._told
+        within, behind = self._tokens.tensor_split([row - self.first], dim=2)
+        return Ahead(behind, self._told, within) if behind.shape[2] else None
 
 
 def views(clean: Tensor, stage: Stage, scenes: int = 1) -> tuple[Tensor, Tensor]:

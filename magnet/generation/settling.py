@@ -59,11 +59,11 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = tuple(
-    replace(SHOWN, iterations=6, inner=40, bend=6000.0, root=root, stand=16.0, hold=2.0) for root in (3.0, 0.3)
+    replace(SHOWN, iterations=6, inner=40, bend=24000.0, root=root, stand=16.0, hold=2.0) for root in (3.0, 0.3)
 )
 """How they are corrected, one after the other, while somebody is left deep in another (`LEFT`): moved out of the way as
-a whole, smoothly, for a hand that jumps is seen more than some centimetres of depth. The second moves people readily,
-which shows at token borders, and keeps out who walks through somebody."""
+a whole, smoothly, for a hand that jumps is seen more than some centimetres of depth. The second moves people readily
+and keeps out who walks through somebody."""
 
 REMEMBERED = 60
 """Frames for which hands that held take hold again where they come near: of 14 gaps between holds of the same hands in
@@ -160,9 +160,9 @@ def settled_block(
     return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
-Later = Callable[[int, Tensor, Scene], Scene | None]
-"""The frames after a block as somebody, by number, expects others (p,) int to go on from its last frames (B, LEAD, P);
-None: nothing is expected."""
+Later = Callable[[int, Tensor, Scene, bool], Scene | None]
+"""How somebody, by number, expects others (p,) int to go on from the two frames (B, LEAD, P) that are shown: after the
+block or, where they are hidden, in it and after it; None: nothing is expected."""
 
 
 class Corrected(NamedTuple):
@@ -316,13 +316,16 @@ def settled_on(
     turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
     for number in turns[moving[turns]]:
         one = agents == number
-        ahead, others = None, sees[number] & ~one & shaped.present.any(dim=0)
-        if later is not None and bool(others.any()):
-            shown = slice(block - LEAD, block)
-            ahead = later(who[number], there[others], corrected(scene.slice(shown.start, block), whole[:, shown]))
-        if ahead is not None:
-            ahead = ahead.replace(body=body.id, valid=None, given=None).permute_agents(there)
-        seen = as_known(shaped, known, one, sees[number], block, ahead)
+        seen = as_known(shaped, known, one, sees[number], block)
+        for hidden, others in ((False, sees[number]), (True, ~sees[number])):
+            others = others & ~one & shaped.present.any(dim=0)
+            if later is None or not bool(others.any()) or (hidden and before is None):
+                continue
+            shown = corrected(scene.slice(block - LEAD, block), whole[:, block - LEAD : block])
+            shown = before.slice(before.frames - LEAD) if hidden and before is not None else shown
+            ahead = later(who[number], there[others], shown, hidden)
+            if ahead is not None:
+                seen = as_expected(seen, ahead.permute_agents(there), others)
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
         offset[:, :, one] = changes[:, :, one]
@@ -334,28 +337,25 @@ def settled_on(
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), Corrected(whole, parted, who)
 
 
-def as_known(
-    scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int, ahead: Scene | None = None
-) -> Scene:
+def as_known(scene: Scene, before: Scene | None, one: Tensor, sees: Tensor, block: int) -> Scene:
     """A block and the frames after it as one person knows them: the others go on from where they were last seen.
 
-    Arguments as for `settled_on`; one, sees (P,) bool, who it is and whom it sees. ahead: the frames after the block as
-    it expects those that it sees to do; None: it takes it that they go on as they went.
+    Arguments as for `settled_on`; one, sees (P,) bool, who it is and whom it sees.
     """
-    hidden, seen = ~sees & ~one, sees & ~one
+    hidden = ~sees & ~one
     if before is None:
         scene = scene.replace(present=scene.present & ~hidden)
     else:
         scene = carried_on(cat_time([before, scene]), hidden, before.frames - 1)
     lead = 0 if before is None else before.frames
-    if ahead is None:
-        return carried_on(scene, seen, lead + block - 1).slice(lead)
-    scene = scene.slice(lead)
-    body_rot, root = (
-        torch.cat([now[:, :block], after], dim=1)
-        for now, after in ((scene.body_rot, ahead.body_rot), (scene.T_world_root, ahead.T_world_root))
-    )
-    return scene.with_poses(seen, body_rot, root)
+    return carried_on(scene, sees & ~one, lead + block - 1).slice(lead)
+
+
+def as_expected(scene: Scene, ahead: Scene, others: Tensor) -> Scene:
+    """The scene with some people (P,) bool in its last frames as in those of another."""
+    lead = scene.frames - ahead.frames
+    body_rot = torch.cat([scene.body_rot[:, :lead], ahead.body_rot], dim=1)
+    return scene.with_poses(others, body_rot, torch.cat([scene.T_world_root[:, :lead], ahead.T_world_root], dim=1))
 
 
 def parted_for(known: Scene, joints: Tensor, past: Corrected | None, who: tuple[int, ...], block: int) -> Tensor:

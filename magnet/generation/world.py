@@ -54,7 +54,7 @@ class WorldState(Places):
         self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode
         self.decoder = Carried(keep=2 * options.blend + 4 * TOKEN_FRAMES)  # seams are decoded again
-        self.decoder_of_others: dict[int, Carried] = {}  # as somebody expects them
+        self.decoder_of_others: dict[tuple[int, bool], Carried] = {}  # as somebody expects them
 
     @torch.inference_mode()
     def make_consistent(self, tokens: Tensor, finished: Tensor, decentralized: bool = False) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 
 from magnet.generation.causal_bodies import EXPECTED, decode_bodies, finalize_bodies, others_expected
 from magnet.generation.conditioning import known_tokens, mask_unknown, receptive_field
+from magnet.generation.expected import Ahead
 from magnet.generation.world import WorldState
 from magnet.motion.frames import canonical_frame, posed
 from magnet.motion.scene import Scene
@@ -34,9 +35,10 @@ def finished(model, scene: Scene, options: SamplerOptions) -> tuple[WorldState, 
     return world, known_tokens(model, scene, torch.ones_like(schedule.known))
 
 
-def everybody(tokens: torch.Tensor) -> torch.Tensor:
-    """Tokens (B, n, P, D) as what each of them expects. -> (B, P, n, P, D)"""
-    return tokens[:, None].expand(-1, tokens.shape[2], -1, -1, -1)
+def expecting(tokens: torch.Tensor, first: bool = True, block: int = 0) -> Ahead:
+    """Everybody, the first perhaps not, expects the same tokens (B, n, P, D), of which so many are of the block."""
+    each = tokens[:, None].expand(-1, tokens.shape[2], -1, -1, -1).clone()
+    return Ahead(each[:, :, block:], torch.tensor([first, True, True]), each[:, :, :block])
 
 
 def same(a: Scene, b: Scene) -> bool:
@@ -69,7 +71,7 @@ def test_nothing_behind_a_block_reaches_its_bodies(model, scene, options):
 def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene):
     world, tokens = finished(model, scene, BARE)
     ahead = receptive_field(model)[1]
-    behind = everybody(tokens[:, 8 : 8 + ahead]), torch.ones(3, dtype=torch.bool)
+    behind = expecting(tokens[:, 8 : 8 + ahead])
     expected = decode_bodies(world, tokens, 6, 8, 8, behind)
     known = decode_bodies(world, tokens, 6, 8, 8 + ahead)
     assert torch.allclose(expected.body_rot, known.body_rot, atol=1e-4)
@@ -81,7 +83,7 @@ def test_what_comes_as_expected_is_decoded_as_if_it_had_been_known(model, scene)
 def test_what_is_expected_behind_a_block_is_decoded_where_its_steps_lead(model, scene, smooth):
     world, tokens = finished(model, scene, dataclasses.replace(BARE, smooth_path=smooth))
     ahead = receptive_field(model)[1]
-    behind = everybody(tokens[:, 8 : 9 + ahead]), torch.ones(3, dtype=torch.bool)
+    behind = expecting(tokens[:, 8 : 9 + ahead])
     expected = decode_bodies(world, tokens, 6, 8, 8, behind, more=1)
     known = decode_bodies(world, tokens, 6, 9, 9 + ahead)
     assert expected.frames == known.frames == 12
@@ -97,7 +99,7 @@ def test_corrections_go_on_to_what_is_expected_of_those_who_told(model, scene):
         finalize_bodies(world, tokens, 6, 6, None)
         generator = torch.Generator().manual_seed(1)
         behind = tokens[:, 7:8] + lift * torch.randn(tokens[:, 7:8].shape, generator=generator)
-        finalize_bodies(world, tokens, 7, 7, (everybody(behind), torch.tensor([told, True, True])))
+        finalize_bodies(world, tokens, 7, 7, expecting(behind, told))
         assert world.correction is not None and world.correction.offset.shape[1] == 2
         return world.given.slice(24, 28)
 
@@ -127,34 +129,37 @@ def test_others_are_expected_as_if_what_they_will_do_had_been_known(model, scene
     ahead = receptive_field(model)[1]
     behind, others = tokens[:, 8 : 8 + EXPECTED + ahead], torch.tensor([1, 2])
     plain = decode_bodies(finished(model, scene, BARE)[0], tokens, 6, 8 + EXPECTED, 8 + EXPECTED + ahead)
-    later = others_expected(world, tokens, 8, EXPECTED, behind, 0, others, plain.slice(6, 8))
+    later = others_expected(world, tokens, 8, EXPECTED, behind, (0, False), others, plain.slice(6, 8))
     assert later.frames == 4 * EXPECTED
     assert torch.allclose(later.body_rot[:, :, 1:], plain.body_rot[:, 8:, 1:], atol=1e-4)
     assert torch.allclose(later.T_world_root[:, :, 1:], plain.T_world_root[:, 8:, 1:], atol=1e-4)
     shifted = plain.slice(6, 8)
     shifted.T_world_root[..., 0, 3] += 1.0
-    moved = others_expected(world, tokens, 8, EXPECTED, behind, 0, others, shifted).T_world_root[:, :, 1:, 0, 3]
+    moved = others_expected(world, tokens, 8, EXPECTED, behind, (0, False), others, shifted).T_world_root[
+        :, :, 1:, 0, 3
+    ]
     assert (moved[:, 0] - later.T_world_root[:, 0, 1:, 0, 3] > 0.7).all()
 
 
 @torch.no_grad()
-def test_corrections_see_what_is_expected_of_those_whose_block_is_seen(model, scene):
-    """Two stand in each other; one is corrected, and expects the other to go on here or there."""
+def test_corrections_see_others_as_they_are_expected_where_they_are_not_seen(model, scene):
+    """Two stand in each other; one is corrected, and expects the other to be here or there in the block or after it."""
     near = scene.replace(T_world_root=scene.T_world_root.clone())
     near.T_world_root[:, :, 0] = near.T_world_root[:, :, 1]
 
-    def shown(change: float, seen: bool) -> Scene:
+    def shown(seen: bool, within: float = 0.0, after: float = 0.0) -> Scene:
         world, tokens = finished(model, near, SamplerOptions(steps=2, settle="firm"))
         finalize_bodies(world, tokens, 6, 6, None)
         if not seen:
             world.saw.fill_(False)
-        behind = everybody(tokens[:, 7 : 7 + EXPECTED]).clone()
-        noise = torch.randn(behind[:, 0, :, 1:].shape, generator=torch.Generator().manual_seed(1))
-        behind[:, 0, :, 1:] += change * noise
-        finalize_bodies(world, tokens, 7, 7, (behind, torch.tensor([True, False, False])))
+        expected, generator = expecting(tokens[:, 6 : 7 + EXPECTED], block=1), torch.Generator().manual_seed(1)
+        for change, part in ((within, expected.within), (after, expected.tokens)):
+            part[:, 0, :, 1:] += change * torch.randn(part[:, 0, :, 1:].shape, generator=generator)
+        finalize_bodies(world, tokens, 7, 7, expected)
         return world.given.slice(24, 28)
 
-    made = shown(0.0, True)
-    assert not same(made, shown(1.0, True))
-    assert same(shown(0.0, False), shown(1.0, False))
-    assert torch.equal(made.body_rot[:, :, 1:], near.body_rot[:, 24:28, 1:])  # given
+    for seen in (True, False):
+        made = shown(seen)
+        assert not same(made, shown(seen, after=1.0))
+        assert same(made, shown(seen, within=1.0)) == seen
+        assert torch.equal(made.body_rot[:, :, 1:], near.body_rot[:, 24:28, 1:])  # given

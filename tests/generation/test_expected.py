@@ -19,11 +19,13 @@ def test_each_agents_first_word_of_what_comes_counts():
     alone = torch.zeros(2, dtype=torch.long)
     expected = Expected(4)
     expected.keep(Stage(5, first, ahead=2), one, alone)
-    tokens, told = expected.behind(8)
-    assert tokens.shape == (1, 2, 2, 2, 4) and told.tolist() == [True, False]
+    ahead = expected.behind(8)
+    assert ahead.tokens.shape == (1, 2, 2, 2, 4) and ahead.told.tolist() == [True, False]
+    assert ahead.within.shape == (1, 2, 1, 2, 4)  # the block's, for who does not see it
     expected.keep(Stage(5, second, ahead=2), two, alone)
-    tokens, told = expected.behind(8)
-    assert told.all() and (tokens[:, 0] == 1).all() and (tokens[:, 1] == 2).all()
+    ahead = expected.behind(8)
+    for tokens in (ahead.tokens, ahead.within):
+        assert ahead.told.all() and (tokens[:, 0] == 1).all() and (tokens[:, 1] == 2).all()
     assert expected.behind(9) is None
 
 
@@ -33,8 +35,8 @@ def test_everybody_expects_others_as_its_own_view_shows_them():
     clean = torch.arange(2.0)[:, None, None, None].expand(1, 2, 5, 2, 4)
     expected = Expected(4)
     expected.keep(Stage(5, rows, ahead=2), clean, torch.tensor([1, 0]))
-    tokens, told = expected.behind(8)
-    assert told.all() and (tokens[:, 0] == 1).all() and (tokens[:, 1] == 0).all()
+    ahead = expected.behind(8)
+    assert ahead.told.all() and (ahead.tokens[:, 0] == 1).all() and (ahead.tokens[:, 1] == 0).all()
 
 
 def test_every_agent_is_read_from_its_own_view_without_guidance():

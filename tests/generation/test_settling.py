@@ -20,13 +20,12 @@ from magnet.body.settle import DOFS
 from magnet.body.settle_wishes import FIRM, LAG
 from magnet.generation import settling
 from magnet.generation.body_guidance import FARTHEST, STEP
+from magnet.generation.causal_bodies import EXPECTED
 from magnet.generation.rollout import generate
 from magnet.generation.settling import (
-    ANEW,
     FINISHED,
     GLIDE,
     PACE,
-    REACH,
     REMEMBERED,
     Corrected,
     around,
@@ -49,6 +48,7 @@ from tests.cases import few, some_quick, some_slow
 BOTH = SamplerOptions(
     steps=3, stride=2, pyramid_offset=0, body_guidance="firm", settle="hold", settle_blocks=True, smooth_path=True
 )
+BEHIND = 4 * EXPECTED
 GRID = Grid(10, 2, 4, steps=2, window=8, stride=2, pyramid_offset=0)
 
 
@@ -191,10 +191,10 @@ def glided(speed: float, frames: int, block: int = 4) -> tuple[Scene, Scene]:
     root = still.T_world_root.clone()
     root[0, :, 0, 0, 3] += speed * (torch.arange(frames) - block).clamp(min=0) / 30.0
     sliding = still.replace(T_world_root=root)
-    new, sees = torch.ones(2 * block, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
+    new, sees = torch.ones(block + BEHIND, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
     shown, past, plain = [sliding.slice(0, block)], None, None
-    for start in range(block, frames - block, block):
-        ahead = sliding.slice(start, start + 2 * block)
+    for start in range(block, frames - BEHIND, block):
+        ahead = sliding.slice(start, start + block + BEHIND)
         made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
         shown.append(made.slice(0, block))
         past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
@@ -203,9 +203,9 @@ def glided(speed: float, frames: int, block: int = 4) -> tuple[Scene, Scene]:
 
 def test_feet_shown_standing_stay_there_block_after_block() -> None:
     """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
-    frames, body = 32, load_body()
+    frames, body = 36, load_body()
     toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in glided(0.15, frames))
-    last = frames - 8
+    last = frames - BEHIND - 4
     assert float((slid[last] - slid[0]).mean()) > 0.09
     assert float((toes[last] - toes[0]).abs().max()) < 0.03
     assert float(toes.diff(dim=0).abs().max()) < 0.005
@@ -228,10 +228,10 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
     root[:, :, 0, 0, 3], root[:, :, 0, 2, 3] = root[:, :, 1, 0, 3] - 0.8, root[:, :, 1, 2, 3]
     root[0, :, 0, 0, 3] += speed / 30 * (torch.arange(frames) - block).clamp(min=0)
     walking, body = still.replace(T_world_root=root), load_body()
-    new = torch.tensor([True, False]).expand(2 * block, -1)
+    new = torch.tensor([True, False]).expand(block + BEHIND, -1)
     shown, past, plain = [walking.slice(0, block)], None, None
-    for start in range(block, frames - block, block):
-        ahead = walking.slice(start, start + 2 * block)
+    for start in range(block, frames - BEHIND, block):
+        ahead = walking.slice(start, start + block + BEHIND)
         made, now = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past, plain)
         shown.append(made.slice(0, block))
         past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
@@ -271,7 +271,7 @@ def test_each_correction_of_a_finished_chunk_follows_where_the_one_before_left_p
     monkeypatch.setattr(settling, "settling", lambda *all, **_: ways.append(all[4]) or in_vain.clone())
     for scene in (apart, within):
         settled_chunk(scene, nobody, "firm", None)
-    assert ways == [FINISHED, FINISHED, *ANEW]
+    assert ways == [FINISHED, FINISHED, *settling.ANEW]
 
 
 def test_where_nobody_is_nothing_is_corrected() -> None:
@@ -394,6 +394,6 @@ def test_only_frames_around_a_moment_are_corrected_more_loosely() -> None:
     frames[0, 30] = True
     share = around(frames)
     assert share.shape == (2, 60) and not share[1].any()
-    assert (share[0, 30 - REACH : 31 + REACH] == 1).all()
-    assert (share[0, : 30 - 3 * REACH] == 0).all() and (share[0, 31 + 3 * REACH :] == 0).all()
+    assert (share[0, 30 - settling.REACH : 31 + settling.REACH] == 1).all()
+    assert (share[0, : 30 - 3 * settling.REACH] == 0).all() and (share[0, 31 + 3 * settling.REACH :] == 0).all()
     assert (share[0, 30:].diff() <= 0).all() and (share[0, :31].diff() >= 0).all()
