@@ -321,8 +321,8 @@ class Rollout:
     def _denoise(self, noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
         self.stats.add_call(len(noisy))
         self._steps_left -= 1
-        if self._steps_left == 0 and self.expected.most:  # it is kept
-            self._asked[len(self._asked) - self._ahead :] = True
+        if self._steps_left == 0 and self.expected.most and self.world.causal:  # from the block on it is kept
+            self._asked |= self._asked.any(dim=1, keepdim=True).cumsum(dim=0) > 0
         if self._ahead:  # nobody's: shown as the mean of pure noise, which tells nothing of anybody
             noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
             levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)

@@ -1,12 +1,18 @@
 """What the model predicts after a block: each agent's first word, in its own view."""
 
 import dataclasses
+import itertools
 
+import pytest
 import torch
 
-from magnet.generation.expected import Expected, own_view, views
+from magnet.generation.expected import Ahead, Expected, own_view, views
+from magnet.generation.rollout import Rollout
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
+from magnet.tasks.agentic import AgenticAsync, AgenticSync
+from magnet.testing import random_scene
 
 
 def test_each_agents_first_word_of_what_comes_counts():
@@ -56,3 +62,23 @@ def test_every_agent_is_read_from_its_own_view_without_guidance():
     assert each.shape == (2, len(kinds), 2, 3, 1) and torch.equal(view_of, of)
     plain = own_view(clean[:, 0].flatten(0, 1), dataclasses.replace(stage, visibility=None), 2)
     assert plain.shape == (2, 2, 3, 1) and (plain[1] == 100).all()
+
+
+@pytest.mark.parametrize("task", [AgenticAsync(), AgenticSync()], ids=str)
+def test_whoever_is_made_later_is_expected_in_the_block_alike_in_every_precision(model, task):
+    """Packed weights predict only what is read, and 0 elsewhere."""
+    scene = random_scene(1, 16, 2, torch.Generator().manual_seed(3))
+
+    def within(precision: str) -> torch.Tensor:
+        options, generator = (
+            SamplerOptions(steps=2, settle="firm", precision=precision),
+            torch.Generator().manual_seed(1),
+        )
+        rollout = Rollout(model, scene, task, 16, 16, 1, options, generator, None, None, chunk=1)
+        list(itertools.islice(rollout.chunks(), 5))
+        ahead = rollout.expected.behind(rollout.expected.row)
+        assert isinstance(ahead, Ahead) and ahead.within.shape[2] == 1
+        return ahead.within[:, :2, :, :2]
+
+    assert model.posterior is None
+    assert torch.allclose(within("float32"), within("reference"), atol=1e-3)
