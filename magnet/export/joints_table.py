@@ -233,7 +233,9 @@ def _seconds(
     good, steps = said[np.isfinite(said)], _steps(said, told)
     counted = np.ones(1) if frames is None else _steps(numbers[:, frames], told)
     usual = max(float(np.median(counted[counted > 0])), 1.0) if (counted > 0).any() else 1.0
-    step = float(np.median(steps[steps > 0])) / usual if len(np.unique(good)) > 2 else 0.0
+    step = 0.0
+    if len(np.unique(good)) > 2:  # where many rows have one time, such as whole seconds, the mean tells
+        step = float(np.median(steps[steps > 0]) if np.median(steps) > 0 else steps.mean()) / usual
     if step * usual == 1 and (steps > 0).all() and (good == np.round(good)).all():
         return (None, f"its column {head[column]} counts frames") if usual < SLOW else (said, "")
     likely = [parts for parts in PARTS if SLOW <= parts / step <= FAST] if step else []

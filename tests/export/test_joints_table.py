@@ -168,3 +168,12 @@ def test_times_far_apart_are_refused_rather_than_filled(tmp_path: Path) -> None:
 def test_a_row_without_anything_is_a_frame_without_anybody_where_rows_are_counted(tmp_path: Path) -> None:
     found = read_table(table(tmp_path / "a.csv", "a_x,a_y,a_z", "1,2,3", ",,", "", "4,5,6", ",,", ""))
     assert found.at.shape[0] == 3 and np.isnan(found.at[1]).all() and found.at[2, 0, 0].tolist() == [4, 5, 6]
+
+
+@pytest.mark.parametrize("start", [0, 1_700_000_000])
+@pytest.mark.parametrize("counted", ["", "frame,"])
+def test_times_of_whole_seconds_are_seconds(counted: str, start: int, tmp_path: Path) -> None:
+    """Of many rows in a second each; they were taken for milliseconds."""
+    rows = [f"{counted and f'{k},'}{start + k // 30},1,2,3" for k in range(121)]
+    found = read_table(table(tmp_path / "a.csv", f"{counted}timestamp,a_x,a_y,a_z", *rows))
+    assert (found.fps, len(found.at), found.told) == (30.0, 121, "")
