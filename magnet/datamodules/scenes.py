@@ -117,7 +117,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         numbers: list[Numbers | None] = []
         names: list[str] = []
         for where, one in people:
-            if there_in_world(one.keys()):
+            if there_in_world(one):
                 notes.append(f"{' and '.join(WORLD)} are taken, not what the camera sees")
             found = list(self._tracks(where, one, notes))
             tracks += found

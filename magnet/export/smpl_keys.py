@@ -66,17 +66,17 @@ def first_of(keys: Sequence[str], there: Collection[str]) -> str | None:
 
 def posed(there: Collection[str]) -> bool:
     """Whether a file with these keys holds rotations of somebody."""
-    return first_of((*WHOLE, *ORIENT), there) is not None or there_in_world(there)
+    return first_of((*WHOLE, *ORIENT), there) is not None or set(WORLD) <= set(there)
 
 
-def there_in_world(there: Collection[str]) -> bool:
-    """Whether a file with these keys says where somebody is in the world, beside what a camera sees."""
-    return all(key in there for key in WORLD)
+def there_in_world(held: Mapping[str, Any]) -> bool:
+    """Whether a file says where somebody is in the world, beside what a camera sees."""
+    return all(held.get(key) is not None for key in WORLD)
 
 
 def in_world(held: Mapping[str, Any]) -> Mapping[str, Any]:
     """What a file holds, with motion in the world, where it has that, under the keys that are looked for first."""
-    if not there_in_world(held.keys()):
+    if not there_in_world(held):
         return held
     pose, place = (held[key] for key in WORLD)
     return ChainMap({WHOLE[0]: pose, **dict.fromkeys(PLACE, place)}, held)  # type: ignore[arg-type]

@@ -127,3 +127,18 @@ def test_places_in_the_world_beat_those_that_a_camera_sees(tmp_path: Path) -> No
     body = load_body()
     shown, wanted = (read_smplx(tmp_path / f"{name}.npz", body)[0] for name in ("camera", "plain"))
     assert (shown.T_world_root - wanted.T_world_root).abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"frame_ids": np.arange(60)[:, None]},
+        {"frame_ids": [f"{frame:06d}.jpg" for frame in range(60)]},
+        {"frame_ids": None, "pose_world": None, "trans_world": None},
+    ],
+    ids=["column", "pictures", "none"],
+)
+def test_frames_in_a_column_or_named_or_said_to_be_none_are_nothing_wrong(more: dict[str, Any], tmp_path: Path) -> None:
+    found = read(tmp_path, seen(0, [*range(60)], numbered=False) | more)
+    assert (found.frames, found.notes) == (60, ()) and found.transl is not None
+    assert np.allclose(found.transl[:, 0], TRUE.transl[:, 0])

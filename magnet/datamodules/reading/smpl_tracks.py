@@ -75,7 +75,7 @@ class PosedTrack:
 
 
 def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: int) -> Numbers | None:
-    """Which frames of a video a person's frames are, (T,); None: the file does not say.
+    """Which frames of a video a person's frames are, (T,); None: the file does not say, or not by numbers.
 
     Args:
         where: for messages.
@@ -86,10 +86,12 @@ def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: i
     Raises:
         DataError: not one whole number a frame, or they do not rise.
     """
-    value = held.get(FRAMES)
-    if value is None:
+    value = np.asarray(held.get(FRAMES))
+    if value.dtype.kind not in "iuf" or not value.size:  # names of pictures, say
         return None
-    given = floats(f"{where}: {FRAMES}", value[person] if np.ndim(value) == 2 else value, (frames,))
+    if value.shape == (frames, 1):
+        value = value[:, 0]
+    given = floats(f"{where}: {FRAMES}", value[person] if value.ndim == 2 else value, (frames,))
     with np.errstate(invalid="ignore"):
         numbers = given.astype(np.int64)
     if (given != numbers).any() or (np.diff(given) <= 0).any() or np.ptp(given) >= LONGEST:
