@@ -49,6 +49,7 @@ def numbered(toy: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Six batches of which no two are alike; handlers are put back."""
     monkeypatch.setattr(ToyData, "train_dataloader", lambda self: Numbered())
     before = {number: signal.getsignal(number) for number in CODES}
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
