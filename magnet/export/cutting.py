@@ -52,7 +52,8 @@ def shared_frames(
 ) -> tuple[list[slice], list[str]]:
     """The frames of each file that are of the moments of all, and a note if any is cut.
 
-    Clocks on which all begin at once tell nothing: each file's may have been set to 0.
+    Clocks on which all begin at once tell nothing: each file's may have been set to 0. Nor do times without a common
+    moment beside such frame numbers: each file's may count from when its sensor was switched on.
 
     Raises:
         ValueError: there is no such moment.
@@ -70,6 +71,9 @@ def shared_frames(
     starts, each = clocks[apart[0]], list(zip(frames, rates, strict=True))
     late = [round((max(starts) - start) * rate) for start, rate in zip(starts, rates, strict=True)]
     lasts = min((many - begin) / rate for (many, rate), begin in zip(each, late, strict=True))
+    if lasts <= 0 and len(clocks) > len(apart):
+        begun = f"by their {apart[0]} files share no moment, and they begin at the same frame number"
+        return [slice(None)] * len(paths), [f"{begun}: taken to begin together"]
     if lasts <= 0:
         said = ", ".join(
             f"{path} from {start - min(starts):.6g} to {start - min(starts) + many / rate:.6g} s"

@@ -14,6 +14,7 @@ from magnet import checkpoints, cli
 from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_csv
+from magnet.export.cutting import Begin, shared_frames
 from magnet.export.reading import Reading, read
 from magnet.motion.scene import Scene
 
@@ -209,6 +210,19 @@ def test_files_of_one_clock_are_cut_to_the_moments_that_they_share(
     assert off(part.scene, salsa.slice(22, 30), body) < 0.02
     with pytest.raises(ValueError, match=rf"by their {what} files share no moment: .*0\.csv from 0 to 2\.13333 s, "):
         read(one_each(salsa, body, tmp_path, 0, columns, by=100), options=options)
+
+
+def test_times_without_a_common_moment_count_for_nothing_beside_frames_that_begin_together() -> None:
+    """As of sensors that count time since they were switched on."""
+    paths = [Path("a.csv"), Path("b.csv")]
+    begins = [Begin(0.0, second, 30.0) for second in (0.0, 100.0)]
+    kept, notes = shared_frames(paths, [300, 300], [30.0, 30.0], begins)
+    assert kept == [slice(None)] * 2
+    assert notes == [
+        "by their times files share no moment, and they begin at the same frame number: taken to begin together"
+    ]
+    kept, notes = shared_frames(paths, [300, 300], [30.0, 30.0], [Begin(0.0, second, 30.0) for second in (0.0, 2.0)])
+    assert kept == [slice(60, 300), slice(0, 240)] and "by their times files begin up to 2 s apart" in notes[0]
 
 
 def test_files_that_begin_together_or_tell_no_moment_are_as_they_were(salsa: Scene, body: Body, tmp_path: Path) -> None:
