@@ -25,6 +25,10 @@ EXPECTED = 2
 """Token steps after a block, as they are expected, that its corrections must be able to go on to
 (docs/experiments_corrections.md, "Others as they are expected")."""
 
+TOLD = 4
+"""Token steps that somebody who is not seen must have told last, for what is expected of them to be decoded from these:
+a lost one among them displaces it by up to 3 cm."""
+
 LEAD = 2
 """Frames in front of a block by which its poses go on: where everybody is, and how fast."""
 
@@ -113,16 +117,18 @@ def expectation(world: World, tokens: Tensor, stop: int, rows: int, expected: Ah
     begins = world.finalized
     block = stop - begins
 
-    def later(one: int, others: Tensor, shown: Scene, hidden: bool) -> Scene | None:
+    def later(one: int, others: Tensor, shown: Scene, hidden: bool) -> tuple[Scene, Tensor] | None:
         if not bool(expected.told[one]):
             return None
         ahead = expected.tokens[:, one]
         if not hidden:
-            return others_expected(world, tokens, stop, rows - block, ahead, (one, False), others, shown)
-        if expected.within.shape[2] != block or not bool(world.placed[begins - 1, others.cpu()].all()):
+            return others_expected(world, tokens, stop, rows - block, ahead, (one, False), others, shown), others
+        told = world.placed[max(begins - TOLD, 0) : begins].all(dim=0).to(others.device)
+        others = others[told[others]]
+        if expected.within.shape[2] != block or not len(others):
             return None
         ahead = torch.cat([expected.within[:, one], ahead], dim=1)
-        return others_expected(world, tokens, begins, rows, ahead, (one, True), others, shown)
+        return others_expected(world, tokens, begins, rows, ahead, (one, True), others, shown), others
 
     return later
 

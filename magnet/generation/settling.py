@@ -160,9 +160,9 @@ def settled_block(
     return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
 
 
-Later = Callable[[int, Tensor, Scene, bool], Scene | None]
+Later = Callable[[int, Tensor, Scene, bool], tuple[Scene, Tensor] | None]
 """How somebody, by number, expects others (p,) int to go on from the two frames (B, LEAD, P) that are shown: after the
-block or, where they are hidden, in it and after it; None: nothing is expected."""
+block or, where they are hidden, in it and after it; and of which of them it is known. None: of nobody."""
 
 
 class Corrected(NamedTuple):
@@ -323,9 +323,9 @@ def settled_on(
                 continue
             shown = corrected(scene.slice(block - LEAD, block), whole[:, block - LEAD : block])
             shown = before.slice(before.frames - LEAD) if hidden and before is not None else shown
-            ahead = later(who[number], there[others], shown, hidden)
-            if ahead is not None:
-                seen = as_expected(seen, ahead.permute_agents(there), others)
+            told = later(who[number], there[others], shown, hidden)
+            if told is not None:
+                seen = as_expected(seen, told[0].permute_agents(there), torch.isin(there, told[1]))
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
         offset[:, :, one] = changes[:, :, one]

@@ -147,9 +147,10 @@ def test_corrections_see_others_as_they_are_expected_where_they_are_not_seen(mod
     near = scene.replace(T_world_root=scene.T_world_root.clone())
     near.T_world_root[:, :, 0] = near.T_world_root[:, :, 1]
 
-    def shown(seen: bool, within: float = 0.0, after: float = 0.0) -> Scene:
+    def shown(seen: bool, within: float = 0.0, after: float = 0.0, lost: bool = False) -> Scene:
         world, tokens = finished(model, near, SamplerOptions(steps=2, settle="firm"))
         finalize_bodies(world, tokens, 6, 6, None)
+        world.placed[4, 1:] = not lost
         if not seen:
             world.saw.fill_(False)
         expected, generator = expecting(tokens[:, 6 : 7 + EXPECTED], block=1), torch.Generator().manual_seed(1)
@@ -158,6 +159,7 @@ def test_corrections_see_others_as_they_are_expected_where_they_are_not_seen(mod
         finalize_bodies(world, tokens, 7, 7, expected)
         return world.given.slice(24, 28)
 
+    assert same(shown(False, lost=True), shown(False, within=1.0, after=1.0, lost=True))  # who has not told glides on
     for seen in (True, False):
         made = shown(seen)
         assert not same(made, shown(seen, after=1.0))
