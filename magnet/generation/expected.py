@@ -19,11 +19,11 @@ class Ahead(NamedTuple):
 
 
 class Expected:
-    """The tokens that the model predicts after a block, as each agent expects them of everybody.
+    """The tokens that the model predicts in a block and after it, as each agent expects them of everybody.
 
     A decoder that looks ahead gives poses that slide and jerk where nothing follows the newest token, and who corrects
     its own poses does well to know what others will do next. The prediction costs nothing: the last denoising step
-    makes it, in each agent's own view, for the token steps `ahead` of the window.
+    makes it, in each agent's own view, for the block and the token steps `ahead` of the window.
 
     Args:
         most: tokens that the decoder looks ahead.
@@ -36,7 +36,7 @@ class Expected:
         self._told = torch.zeros(0, dtype=torch.bool)
 
     def keep(self, stage: Stage, clean: Tensor, view_of: Tensor) -> None:
-        """Keep what a stage predicts after its block.
+        """Keep what a stage predicts in its block and after it.
 
         Of each agent the first prediction is kept: later stages of the same block see more than it may.
 

@@ -302,8 +302,7 @@ def settled_on(
     known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
-    offset, moving = shaped.T_world_root.new_zeros(*shaped.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    whole = offset.new_zeros(*scene.T_world_root.shape[:3], DOFS)
+    whole, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
     parted = last = None
     if known is not None:
         joints = body.joints(known)
@@ -321,14 +320,15 @@ def settled_on(
             others = others & ~one & shaped.present.any(dim=0)
             if later is None or not bool(others.any()) or (hidden and before is None):
                 continue
-            shown = corrected(scene.slice(block - LEAD, block), whole[:, block - LEAD : block])
-            shown = before.slice(before.frames - LEAD) if hidden and before is not None else shown
+            if hidden and before is not None:
+                shown = before.slice(before.frames - LEAD)
+            else:
+                shown = corrected(scene.slice(block - LEAD, block), whole[:, block - LEAD : block])
             told = later(who[number], there[others], shown, hidden)
             if told is not None:
                 seen = as_expected(seen, told[0].permute_agents(there), torch.isin(there, told[1]))
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
-        offset[:, :, one] = changes[:, :, one]
         whole[:, :, who[number]] = changes[:, :, number]
         if bool(sees[:, number].any()):
             done = corrected(shaped, changes * one[:, None])
