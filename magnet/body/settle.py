@@ -182,7 +182,7 @@ def correct_window(
     ]  # scene by scene: no scene depends on the others
     at_once, one_by_one = bool(few.any()), not bool(few.all())
     done = torch.zeros_like(few)
-    goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard)
+    goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard, settle.swing)
     for _ in range(settle.iterations):
         R_world, joints = body.bone_chain(*moved(scene.body_rot, scene.T_world_root, offset), rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)

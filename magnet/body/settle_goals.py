@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from magnet.body.indices import indices, pairs_of
-from magnet.body.joints import FEET, TOES, WRISTS
+from magnet.body.joints import ANKLES, FEET, TOES, WRISTS
 from magnet.body.settle_wishes import Wishes
 
 WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
@@ -42,7 +43,8 @@ class Goals:
     """What people who are free shall fulfil, as rows; depth apart.
 
     Attributes:
-        rows: three of each pair of hands that hold, then those of feet.
+        rows: three of each pair of hands that hold, then those of feet, last the floor under the four joints of each
+            free node's.
         holds: how many pairs of hands.
         pull: metres, see `Settle`.
         float_node: (F,) nodes whose lower foot shall not be too high.
@@ -51,6 +53,9 @@ class Goals:
         float_weight: square root of what it costs.
         both: (B, T, Q) bool, pairs of people who may be deep in each other.
         own: b, t, p of each free node.
+        before: (B, 1, P, 22, 3) joints in the frame before; None: there is none.
+        swing: factor of what it costs that toes swing too low; 0: they may.
+        fps: frames a second.
         between: cost of a squared metre of depth between people.
     """
 
@@ -63,6 +68,9 @@ class Goals:
     float_weight: float
     both: Tensor
     own: tuple[Tensor, Tensor, Tensor]
+    before: Tensor | None
+    swing: float
+    fps: float
     between: float
 
     @classmethod
@@ -74,10 +82,11 @@ class Goals:
         hold: float = 1.0,
         pull: float = math.inf,
         hard: float = 1.0,
+        swing: float = 0.0,
     ) -> Goals:
         """The goals of people who are free (B, T, P) bool.
 
-        wishes: `Wishes.of_those` who are free; stand, hold, pull, hard: see `Settle`.
+        wishes: `Wishes.of_those` who are free; stand, hold, pull, hard, swing: see `Settle`.
         """
         T, P = free.shape[1:]
         first, second = pairs_of(P, free.device)
@@ -96,7 +105,11 @@ class Goals:
         if wishes.stood is not None:
             b, p, i = wishes.stood.isfinite().all(dim=-1).nonzero(as_tuple=True)
             parts.append(rows_of("stand", node(b, b * 0, p), feet[i], (0, 2), wishes.stood[b, p, i], stand))
-        b, t, p, i = wishes.heights.isfinite().nonzero(as_tuple=True)
+        keep = wishes.heights.isfinite()
+        if swing:  # toes that stand neither before nor after are to be lifted
+            standing = wishes.stands[..., len(ANKLES) :]
+            keep = keep & (F.pad(standing, (0, 0, 0, 0, 1, 0)) | F.pad(standing, (0, 0, 0, 0, 0, 1)))
+        b, t, p, i = keep.nonzero(as_tuple=True)
         parts.append(rows_of("height", node(b, t, p), toes[i], (1,), wishes.heights[b, t, p, i][:, None]))
         b, t, p = free.nonzero(as_tuple=True)
         own, low = (b, t, p), -wishes.clearance[b, p].view(-1, 1)
@@ -114,6 +127,9 @@ class Goals:
             both=(wishes.present[:, first] & wishes.present[:, second])[:, None]
             & (free[..., first] | free[..., second]),
             own=own,
+            before=wishes.before,
+            swing=swing,
+            fps=wishes.fps,
             between=WEIGHTS["between"] * hard,
         )
 

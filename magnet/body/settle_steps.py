@@ -53,6 +53,7 @@ class Settle:
         shrug: factor for turning the shoulder girdle; infinite: it stays, to 1e-9 radians.
         most: largest change of a step, metres or radians.
         stand: factor for the cost of standing feet that move.
+        swing: factor for the cost of toes that swing too low over the floor; 0: they may drag.
         hold: factor for the cost of held hands that part.
         takes: metres between hands that take hold, where hands that met go on holding.
         pull: metres that held hands may be off before they pull no harder: a hand far away shall not jerk the body.
@@ -70,6 +71,7 @@ class Settle:
     shrug: float = math.inf
     most: float = 0.15
     stand: float = 1.0
+    swing: float = 0.0
     hold: float = 1.0
     takes: float = HELD
     pull: float = math.inf

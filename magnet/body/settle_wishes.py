@@ -46,6 +46,7 @@ class Wishes:
         stands: (B, T - 1, P, 4) bool, joints of the feet that shall not move over the floor from a frame to the next.
         stood: (B, P, 4, 2) metres, where on the floor joints of the feet were in the frame before and shall stay, NaN
             for others; None: there is no frame before.
+        before: (B, 1, P, 22, 3) joints in the frame before; None: there is none.
         heights: (B, T, P, 2) metres over y = 0 of low toes, NaN for others.
         highest: (B, T, P) metres over the floor that the lower foot shall be at most: 0 for who floats, as it is for
             who stands or steps, infinite for who jumps.
@@ -59,6 +60,7 @@ class Wishes:
     clearance: Tensor
     stands: Tensor
     stood: Tensor | None
+    before: Tensor | None
     heights: Tensor
     highest: Tensor
     held: Tensor
@@ -113,7 +115,17 @@ class Wishes:
         heights = torch.where(on, kept, torch.nan)
         highest = torch.where(floats, 0.0, torch.where(height > FLOATS, torch.inf, height.clamp_min(LIFTED)))
         return cls(
-            CONTACT[FIRM.get(how, how)], scene.present, above, stands, stood, heights, highest, held, between, scene.fps
+            CONTACT[FIRM.get(how, how)],
+            scene.present,
+            above,
+            stands,
+            stood,
+            None if before is None else before[1],
+            heights,
+            highest,
+            held,
+            between,
+            scene.fps,
         )
 
     def of_those(self, free: Tensor) -> Wishes:
@@ -134,6 +146,7 @@ class Wishes:
         return replace(
             self,
             stood=self.stood if start == 0 else None,
+            before=self.before if start == 0 else None,
             stands=self.stands[:, start : max(stop - 1, start)],
             heights=self.heights[:, frames],
             highest=self.highest[:, frames],

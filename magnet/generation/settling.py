@@ -27,11 +27,14 @@ LEAD_TOKENS = 2
 BLOCK = Settle(iterations=4, inner=16, speed=10.0, bend=3000.0)
 """How a block is corrected before the model goes on from it: stiffly, since it is short; the end sees to the rest."""
 
-FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, hold=2.0)
+FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, swing=4.0, hold=2.0)
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/experiments_corrections.md)."""
 
-ANEW = (STUBBORN, replace(STUBBORN, root=0.3, hold=0.3, hard=200.0))
+ANEW = (
+    replace(STUBBORN, swing=4.0),
+    replace(STUBBORN, swing=4.0, root=0.3, hold=0.3, hard=200.0),
+)
 """How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another: smoothly, for who is
 thrown out of another within two frames is seen more than some centimetres of depth. The second moves whole people
 aside, and hands give way (docs/experiments_corrections.md, "Nobody is thrown")."""
@@ -46,7 +49,8 @@ SHOWN = Settle(
     lift=10.0,
     shrug=5.0,
     most=0.4,
-    stand=96.0,
+    stand=24.0,
+    swing=20.0,
     hold=30.0,
     takes=0.3,
     pull=0.1,

@@ -122,7 +122,7 @@ def test_people_in_each_other_are_corrected_by_what_a_step_may_be(heavy: float) 
     place = torch.randn(2, 20, 3, 3, generator=draw) * 0.05 + torch.tensor([0.0, 0.9, 0.0])
     betas, present = torch.randn(2, 3, 10, generator=draw), torch.ones(2, 3, dtype=torch.bool)
     scene = Scene(turns[..., 1:, :, :], rigid(turns[..., 0, :, :], place), betas, present, body=body.id)
-    settle = replace(SHOWN, stay=0.01, root=0.1, stand=heavy, hold=heavy, hard=heavy)
+    settle = replace(SHOWN, stay=0.01, root=0.1, stand=heavy, swing=heavy, hold=heavy, hard=heavy)
     offset = settling(scene, body, "hold", settle=settle)
     assert offset.isfinite().all()
     assert 0.1 < float(offset.abs().max()) <= 3 * 0.4 + 1e-4
@@ -135,7 +135,7 @@ def standing_scene(frames: int, people: int = 2) -> Scene:
 def test_somebody_who_stands_still_is_corrected_however_much_it_weighs() -> None:
     """Slopes of a foot that stands nearly cancel between two frames."""
     scene = standing_scene(frames=8)
-    heavy = replace(SHOWN, iterations=1, stay=0.01, root=0.1, stand=1e5, hold=1e5, hard=1e5)
+    heavy = replace(SHOWN, iterations=1, stay=0.01, root=0.1, stand=1e5, swing=1e5, hold=1e5, hard=1e5)
     assert settling(scene, BODY, "hold", settle=heavy).isfinite().all()
 
 
