@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,15 +16,9 @@ from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
 from magnet.datamodules.reading.own import OwnReader, require_alone
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import DataError, Family, Recording
-from magnet.datamodules.reading.smpl_tracks import (
-    Numbers,
-    PosedTrack,
-    frame_numbers,
-    of_own_axes,
-    on_one_clock,
-    require_one_beginning,
-)
+from magnet.datamodules.reading.smpl_tracks import PosedTrack, of_one_beginning, of_own_axes, on_one_clock
 from magnet.datamodules.registry import register_reader
+from magnet.export.smpl_clock import frame_numbers
 from magnet.export.smpl_keys import (
     BODY,
     ORIENT,
@@ -83,7 +78,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
-    version: ClassVar[int] = 2  # frames are numbered, the world beats the camera, each file has its axis
+    version: ClassVar[int] = 3  # numbered frames tell the moments of several files, too
 
     def __init__(self, root: str | Path, fps: float | None = None, **kwargs: Any) -> None:
         super().__init__(root, **kwargs)
@@ -114,16 +109,16 @@ class ScenesReader(OwnReader[PosedTrack]):
         people = list(_people(path, held))
         notes: list[str] = []
         tracks: list[PosedTrack] = []
-        numbers: list[Numbers | None] = []
         names: list[str] = []
         for where, one in people:
             if there_in_world(one):
                 notes.append(f"{' and '.join(WORLD)} are taken, not what the camera sees")
             found = list(self._tracks(where, one, notes))
-            tracks += found
-            numbers += [frame_numbers(where, one, track.frames, p) for p, track in enumerate(found)]
+            tracks += [
+                replace(track, numbers=frame_numbers(where, one, track.frames, p)) for p, track in enumerate(found)
+            ]
             names += [where if len(found) == 1 else f"{where}, person {p + 1}" for p in range(len(found))]
-        tracks, said = on_one_clock(path, tracks, numbers, names)
+        tracks, said = on_one_clock(path, tracks, names)
         if len(people) > 1:
             one_length(path, {name: track.frames for name, track in zip(names, tracks, strict=True)})
         require_alone(path, len(tracks), alone)
@@ -173,10 +168,11 @@ class ScenesReader(OwnReader[PosedTrack]):
             )
 
     def together(self, group: SceneFiles, tracks: list[PosedTrack], notes: list[str]) -> list[PosedTrack]:
-        """With one beginning, unless a table says when each begins, and the axis that points up in each one's file."""
+        """On one clock, unless a table says when each begins, and the axis that points up in each one's file."""
         files = [person_file.file for person_file in group.people]
-        if len(files) > 1 and self.table is None:
-            require_one_beginning(files, tracks)
+        if len(files) > 1 and all(person_file.start is None for person_file in group.people):
+            tracks, said = of_one_beginning(files, tracks)
+            notes += said
         if any(track.body for track in tracks):  # a scene of ours: y
             return tracks
         tracks, said = of_own_axes(files, tracks)

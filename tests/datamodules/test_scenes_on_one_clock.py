@@ -103,13 +103,40 @@ def test_numbers_that_do_not_tell_are_refused(kind: str, tmp_path: Path) -> None
         read(tmp_path, held)
 
 
-def test_files_of_one_scene_that_begin_with_other_frames_need_a_table(tmp_path: Path) -> None:
-    for p, first in enumerate((0, 15)):
-        np.savez(tmp_path / f"walk_{'AB'[p]}.npz", **seen(p, [*range(first, 60)]))
-    with pytest.raises(DataError, match=r"frame_ids of its scene's files begin at 0 \(walk_A.npz\), 15 \(walk_B.npz\)"):
+def pair(root: Path, first: int, rate: float = 30.0, numbered: bool = True) -> None:
+    """Two people's files, the second from a later frame of the video on."""
+    np.savez(root / "walk_A.npz", fps=30.0, **seen(0, [*range(50)]))
+    np.savez(root / "walk_B.npz", fps=rate, **seen(1, [*range(first, 60)], numbered))
+
+
+def test_several_files_of_a_scene_are_laid_on_each_other_by_the_numbers_of_frames(tmp_path: Path) -> None:
+    pair(tmp_path, 15)
+    found = read(tmp_path)
+    assert (found.frames, off(found, 15) < 1e-5) == (35, True)
+    assert any("walk_A.npz: frame_ids are 0 to 49, 15 to 59: cut to what all have, 15 to 49" in n for n in found.notes)
+    reader = ScenesReader(tmp_path)
+    assert reader.part_of(reader.takes()[0]).whole == 35 / 30
+
+
+def test_a_table_that_says_when_files_begin_beats_the_numbers_of_frames(tmp_path: Path) -> None:
+    pair(tmp_path, 15)
+    for starts, first in ((("", ""), 15), (("0", "0.5"), 15), (("0", "0"), 0)):
+        rows = [f"walk,{who},walk_{who}.npz,{start}\n" for who, start in zip("AB", starts, strict=True)]
+        (tmp_path / "people.csv").write_text("scene,person,file,start\n" + "".join(rows))
+        found = read(tmp_path)
+        assert np.allclose(found.transl[0, 0], TRUE.transl[first, 0])  # type: ignore[index]
+        assert np.allclose(found.transl[0, 1], TRUE.transl[15, 1])  # type: ignore[index]
+
+
+def test_files_of_other_rates_that_begin_with_other_frames_need_a_table(tmp_path: Path) -> None:
+    pair(tmp_path, 15, rate=60.0)
+    with pytest.raises(DataError, match=r"begin at 0 \(walk_A.npz\), 15 \(walk_B.npz\); say when each begins"):
         read(tmp_path)
-    (tmp_path / "people.csv").write_text("scene,person,file,start\nwalk,A,walk_A.npz,0\nwalk,B,walk_B.npz,0.5\n")
-    assert off(read(tmp_path), 15) < 1e-5
+    pair(tmp_path, 0, rate=60.0)
+    assert read(tmp_path).frames == 30
+    pair(tmp_path, 0, numbered=False)
+    with pytest.raises(DataError, match=r"walk_B.npz has none; give everybody theirs, or leave all out"):
+        read(tmp_path)
 
 
 def test_places_in_the_world_beat_those_that_a_camera_sees(tmp_path: Path) -> None:

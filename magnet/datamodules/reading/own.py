@@ -231,7 +231,6 @@ class OwnReader(Reader, Generic[T]):
         """The scene, or the part of it that the take is."""
         group, part = self._meant(take)
         tracks, names, notes = self._people(group)
-        tracks = self.together(group, tracks, notes)
         frames = min(track.frames for track in tracks)
         if len({track.frames for track in tracks}) > 1:
             lengths = ", ".join(f"{n or p} {t.frames}" for p, (n, t) in enumerate(zip(names, tracks, strict=True)))
@@ -262,12 +261,12 @@ class OwnReader(Reader, Generic[T]):
             held, said = self.open(person_file, len(group.people) == 1)
             notes += said
             tracks += held
-            starts += [person_file.start] * len(held)
+            starts += [person_file.start or 0.0] * len(held)
             names += [person_file.person] if len(held) == 1 else [""] * len(held)  # else as the file calls them
         if group.alone:
             notes.append("named like one of several people, but no other file goes with it")
-        tracks = self._one_rate(tracks, group, notes)
-        return _from_latest(tracks, starts, group), names, notes
+        tracks = _from_latest(self._one_rate(tracks, group, notes), starts, group)
+        return self.together(group, tracks, notes), names, notes
 
     def _meant(self, take: Take) -> tuple[SceneFiles, Split | None]:
         if take.name in self.groups:

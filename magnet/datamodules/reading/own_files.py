@@ -38,12 +38,12 @@ class PersonFile:
     Args:
         person: a name or role; "" where nothing tells.
         file: where it is.
-        start: second of the scene's clock at which its first frame lies.
+        start: second of the scene's clock at which its first frame lies; None: nothing says it.
     """
 
     person: str
     file: Path
-    start: float = 0.0
+    start: float | None = None
 
 
 @dataclass(frozen=True)
@@ -240,9 +240,11 @@ def _file(where: str, root: Path, name: str, suffixes: Sequence[str]) -> Path:
     return path
 
 
-def _seconds(where: str, text: str) -> float:
+def _seconds(where: str, text: str) -> float | None:
+    if not text:
+        return None
     try:
-        start = float(text or 0.0)
+        start = float(text)
     except ValueError:
         start = math.nan
     if not math.isfinite(start):

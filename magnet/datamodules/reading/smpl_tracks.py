@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from magnet.body import load_body
-from magnet.datamodules.reading.arrays import Doubles, floats
-from magnet.datamodules.reading.recording import Axis, DataError, Gender
+from magnet.datamodules.reading.arrays import Doubles
+from magnet.datamodules.reading.recording import Axis, Gender
 from magnet.export.npz import stance_in
 from magnet.export.rig import UP
+from magnet.export.smpl_clock import Numbers, require_one_beginning, shared_clock
 from magnet.export.smpl_keys import SMPLX_PELVIS
 from magnet.export.upright import agreed, axis_of, said
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
 from magnet.motion.rotations import from_rotvec, quat_from_rotvec, quat_to_rotvec
 from magnet.motion.scene import Scene
-
-Numbers = NDArray[np.int64]
-
-FRAMES = "frame_ids"
-"""Under which trackers say which frames of a video somebody was seen in."""
-LONGEST = 1_000_000
-"""Frames between the first and the last one of a file that are believed: nine hours at 30 a second."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +39,8 @@ class PosedTrack:
     gender: Gender | None = None
     name: str = ""
     said_fps: float | None = None
-    first: int | None = None  # number of its first frame, where the file numbers them
+    numbers: Numbers | None = None  # (T,) of its frames, where the file has them and it is not resampled
+    first: int | None = None  # the number of the file's first frame
     up: Axis = "+y"  # of its own file
 
     @property
@@ -55,7 +49,8 @@ class PosedTrack:
 
     def slice(self, start: int, stop: int) -> PosedTrack:
         part = slice(start, stop)
-        return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part])
+        numbers = None if self.numbers is None else self.numbers[part]
+        return replace(self, poses=self.poses[part], place=self.place[part], valid=self.valid[part], numbers=numbers)
 
     def resampled(self, fps: float) -> PosedTrack:
         if fps == self.fps:
@@ -68,51 +63,23 @@ class PosedTrack:
             poses=quat_to_rotvec(quat).numpy(),
             place=resample_points(torch.from_numpy(self.place), self.fps, fps).numpy(),
             valid=resample_valid(self.valid[:, None], self.fps, fps)[:, 0],
+            numbers=None,
         )
 
 
 # -- one clock ---------------------------------------------------------------------------------
 
 
-def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: int) -> Numbers | None:
-    """Which frames of a video a person's frames are, (T,); None: the file does not say, or not by numbers.
-
-    Args:
-        where: for messages.
-        held: what the file has of one person, or of several along the first axis.
-        frames: T.
-        person: which of several.
-
-    Raises:
-        DataError: not one whole number a frame, or they do not rise.
-    """
-    value = np.asarray(held.get(FRAMES))
-    if value.dtype.kind not in "iuf" or not value.size:  # names of pictures, say
-        return None
-    if value.shape == (frames, 1):
-        value = value[:, 0]
-    given = floats(f"{where}: {FRAMES}", value[person] if value.ndim == 2 else value, (frames,))
-    with np.errstate(invalid="ignore"):
-        numbers = given.astype(np.int64)
-    if (given != numbers).any() or (np.diff(given) <= 0).any() or np.ptp(given) >= LONGEST:
-        raise DataError(
-            f"{where}: {FRAMES}: got {given[0]:g} to {given[-1]:g} for {frames} frames, expected whole numbers that "
-            f"rise from frame to frame, by less than {LONGEST:,} in all; mend them, or leave them out"
-        )
-    return numbers
-
-
 def on_one_clock(
-    path: Path, tracks: Sequence[PosedTrack], numbers: Sequence[Numbers | None], names: Sequence[str]
+    where: object, tracks: Sequence[PosedTrack], names: Sequence[str]
 ) -> tuple[list[PosedTrack], list[str]]:
-    """People of one file from the frame that the last of them begins with to the one that the first of them ends with.
+    """People from the frame that the last of them begins with to the one that the first of them ends with.
 
-    Frames between these in which a person was not seen are not valid.
+    Frames between these in which a person was not seen are not valid. Who has no numbers stays as they are.
 
     Args:
-        path: the file.
-        tracks: its people.
-        numbers: of each one's frames.
+        where: the file or files, for messages.
+        tracks: their people.
         names: of the people, for messages.
 
     Returns:
@@ -121,49 +88,41 @@ def on_one_clock(
     Raises:
         DataError: only some have numbers, or they share no frame.
     """
-    known = [one for one in numbers if one is not None]
-    if not known:
+    clock = shared_clock(where, [track.numbers for track in tracks], names)
+    if clock is None:
         return list(tracks), []
-    if len(known) < len(tracks):
-        lack = ", ".join(name for name, one in zip(names, numbers, strict=True) if one is None)
-        raise DataError(f"{path}: {FRAMES} say when others were seen, but {lack} has none; give everybody theirs")
-    spans = [f"{one[0]} to {one[-1]}" for one in known]
-    first, last = max(one[0] for one in known), min(one[-1] for one in known)
-    if first > last:
-        raise DataError(f"{path}: people were never seen together: {FRAMES} {', '.join(spans)}; save them apart")
-    step = max(int(np.gcd.reduce(np.concatenate([one - known[0][0] for one in known]))), 1)
-    clock = np.arange(first, last + 1, step)
-    notes = [f"{path}: {FRAMES} rise by {step}: frames are taken for neighbours"] if step > 1 else []
-    if len(set(spans)) > 1:
-        notes.append(f"{path}: {FRAMES} are {', '.join(spans)}: cut to what all have, {first} to {last}")
-    aligned = []
-    for track, one, name in zip(tracks, known, names, strict=True):
-        at = np.searchsorted(one, clock, side="right") - 1
-        seen = one[at] == clock
-        aligned.append(
-            replace(track, poses=track.poses[at], place=track.place[at], valid=track.valid[at] & seen, first=int(first))
+    aligned = [
+        replace(
+            track,
+            poses=track.poses[at],
+            place=track.place[at],
+            valid=track.valid[at] & seen,
+            numbers=clock.numbers,
+            first=int(clock.numbers[0]),
         )
-        if lost := int((~seen).sum()):
-            notes.append(f"{name}: {lost} of {len(clock)} frames are not in {FRAMES}, taken as not tracked: cut out")
-    return aligned, notes
+        for track, at, seen in zip(tracks, clock.at, clock.seen, strict=True)
+    ]
+    return aligned, list(clock.notes)
 
 
-def require_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> None:
-    """Refuse files of one scene whose frames have other numbers at their beginnings: they are laid on each other there.
+def of_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tuple[list[PosedTrack], list[str]]:
+    """People of several files of one scene on the clock that their files' numbers tell, as those of one file.
 
     Args:
         files: of the scene.
         tracks: the person of each.
 
+    Returns:
+        The people, and what should be known of them.
+
     Raises:
-        DataError: they begin with different numbers.
+        DataError: only some have numbers, they share no frame, or they begin with different ones at different rates.
     """
-    begun = {file.name: track.first for file, track in zip(files, tracks, strict=True) if track.first is not None}
-    if len(set(begun.values())) > 1:
-        raise DataError(
-            f"{files[0]}: {FRAMES} of its scene's files begin at {', '.join(f'{n} ({f})' for f, n in begun.items())}: "
-            "say when each begins, in seconds, by `start` in a table (docs/own.md), or save the people in one file"
-        )
+    if any(track.said_fps not in (None, track.fps) for track in tracks):
+        begun = {file.name: track.first for file, track in zip(files, tracks, strict=True)}
+        require_one_beginning(files[0], begun, "say when each begins, in seconds, by `start` in a table (docs/own.md)")
+        return list(tracks), []
+    return on_one_clock(files[0], tracks, [file.name for file in files])
 
 
 # -- what points up ----------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def test_a_table_tells_people_roles_and_when_they_begin(tmp_path: Path) -> None:
     table.write_text("Scene;file;Person;role;start\ntango;a.bvh;anna;leader;\ntango;sub/b.bvh;ben;follower;1.5\n\n")
     (group,) = by_table(tmp_path, table, (".bvh",))
     assert [(person_file.person, person_file.file.name, person_file.start) for person_file in group.people] == [
-        ("anna leader", "a.bvh", 0.0),
+        ("anna leader", "a.bvh", None),
         ("ben follower", "b.bvh", 1.5),
     ]
 
