@@ -13,6 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
+from magnet.export.table_times import (
+    frames_by_time,
+    require_one_recording,
+    require_times_with_frames,
+    require_told_apart,
+)
 from magnet.files import regular, said_sign
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
@@ -21,8 +27,6 @@ AXIS_FIRST = re.compile(r"(?i)^([xyz])[ _.:-]+(.+?)(?:[ _.(\[]+(mm|cm|m)[)\]]?)?
 """An axis, a joint's name, and perhaps a unit: x_LHip, X.LeftHip (mm)."""
 FRAME, TIME = ("frame", "frame_id", "frame_index"), ("time_s", "time", "seconds", "t", "timestamp")
 PERSON = ("person", "person_id", "id", "track", "track_id", "subject", "actor", "skeleton")
-NEAR = 0.3
-"""Share of a frame within which times of several people are of one frame."""
 SLOWEST = 1.0
 """Seconds from a frame to the next at most."""
 SLOW, FAST = 10.0, 1000.0
@@ -60,7 +64,7 @@ def read_table(path: str | Path) -> JointTable:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: no text in UTF-8, no such columns, rows that are cut short, two rows of one frame and person, frames
-            that nothing tells, too many frames, several scenes.
+            that nothing tells, too many frames, several scenes or recordings, or people of different rates.
     """
     path = Path(path)
     sign, at_line, rows = _rows(path)
@@ -84,9 +88,11 @@ def read_table(path: str | Path) -> JointTable:
         raise ValueError(f"{path}: its column {head[person_at or 0]} names {len(people)} people; is it a row's number?")
     seconds, told_in = (None, "") if time_at is None else _seconds(numbers, time_at, frame_at, told, head)
     frame_at = time_at if seconds is None and frame_at is None else frame_at
-    frame, step = _frames(path, numbers, frame_at, told, seconds)
-    at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     where = np.array(list(columns.values()))
+    if frame_at is None and seconds is not None and len(people) == 1:
+        require_told_apart(path, seconds, numbers[:, where.ravel()])
+    frame, step = _frames(path, numbers, frame_at, told, seconds, at_line[1:])
+    at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     seen: set[tuple[int, str]] = set()
     for number, (t, person) in enumerate(zip(frame.tolist(), told, strict=True)):
         if (t, person) in seen:
@@ -99,7 +105,7 @@ def read_table(path: str | Path) -> JointTable:
     at[(at == 0).all(axis=-1)] = np.nan  # as many trackers say that they did not find a joint
     if (at > MOST_AWAY).any() or (at < -MOST_AWAY).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
-    fps = None if seconds is None else _rate(seconds, frame)
+    fps = None if seconds is None else _rate(seconds, frame, told)
     first = None if frame_at is None else int(numbers[:, frame_at].min())
     second = None if seconds is None else _first_time(seconds, frame, fps)
     return JointTable(tuple(columns), people, at, fps, unit, step, first, second, told_in)
@@ -164,12 +170,17 @@ def _number(path: Path, line: int, row: Sequence[str], k: int, sign: str) -> flo
 
 
 def _frames(
-    path: Path, numbers: Floats, column: int | None, told: Sequence[str], seconds: Floats | None
+    path: Path,
+    numbers: Floats,
+    column: int | None,
+    told: Sequence[str],
+    seconds: Floats | None,
+    lines: Sequence[int],
 ) -> tuple[NDArray[np.int64], int]:
     """The frame of each row, from 0, and by how many the file counts on from one to the next."""
     if column is None:
         if seconds is not None and np.isfinite(seconds).all():
-            frame = _by_time(seconds, told)
+            frame = frames_by_time(path, seconds, told, lines)
             if frame.max() >= LONGEST:
                 long = f"{np.ptp(seconds):.6g} seconds"
                 raise ValueError(f"{path}: times of {long}, more frames than are read ({LONGEST})")
@@ -189,30 +200,15 @@ def _frames(
     said = numbers[:, column]
     if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:
         raise ValueError(f"{path}: frame {wrong[0]:g}: expected whole numbers")
+    if len(set(zip(told, said.tolist(), strict=True))) < len(said):
+        require_one_recording(path, said, told, lines, "frames")
+    if seconds is not None:
+        require_times_with_frames(path, seconds, said, told, lines)
     frame = np.minimum(said - said.min(), 2.0**53).astype(np.int64)
     step = max(int(np.gcd.reduce(frame)), 1) if len(set(frame.tolist())) > 2 else 1
     if frame.max() // step >= LONGEST:
         raise ValueError(f"{path}: frames {said.min():.0f} to {said.max():.0f}, more than is read ({LONGEST})")
     return frame // step, step
-
-
-def _by_time(seconds: Floats, told: Sequence[str]) -> NDArray[np.int64]:
-    """The frames of rows by their times, of which some may be missing: of several people, rows of one time are of one.
-
-    The rows of one person are frames in order, so that times may be as coarse as whole seconds.
-    """
-    alone = len(set(told)) == 1
-    own = [np.diff(np.sort(seconds[[who == person for who in told]])) for person in set(told)]
-    steps = np.concatenate(own)
-    usual = float(np.quantile(steps[steps > 0], 0.5, method="lower")) if (steps > 0).any() else np.inf
-    step = float(steps[np.abs(steps - usual) < usual / 2].mean()) if np.isfinite(usual) else np.inf
-    times = seconds if alone else np.unique(seconds)
-    later = np.diff(times)
-    on = np.clip(np.floor(later / step + NEAR), 1, LONGEST)  # a frame late counts as a gap, half a frame does not
-    if not alone:
-        on[later <= (NEAR * usual if np.isfinite(usual) else 0.0)] = 0
-    frame = np.concatenate([[0], np.cumsum(on)])
-    return np.asarray(frame if alone else frame[np.searchsorted(times, seconds)], np.int64)
 
 
 def _steps(values: Floats, told: Sequence[str]) -> Floats:
@@ -253,9 +249,15 @@ def _first_time(seconds: Floats, frame: NDArray[np.int64], fps: float | None) ->
     return float(seconds[row] - (frame[row] / fps if fps else 0.0))
 
 
-def _rate(seconds: Floats, frame: NDArray[np.int64]) -> float | None:
-    """Frames a second, by the first and the last row that say a time."""
-    good = np.isfinite(seconds)
-    if not good.any() or np.ptp(seconds[good]) <= 0 or np.ptp(frame[good]) <= 0:
+def _rate(seconds: Floats, frame: NDArray[np.int64], told: Sequence[str]) -> float | None:
+    """Frames a second, by the first and the last row that say a time, of who has them for longest."""
+    good, whose = np.isfinite(seconds), np.array(told)
+    found: list[tuple[float, float]] = []
+    for person in dict.fromkeys(told):
+        mine = good & (whose == person)
+        if mine.any() and np.ptp(seconds[mine]) > 0 and np.ptp(frame[mine]) > 0:
+            found.append((float(np.ptp(seconds[mine])), float(np.ptp(frame[mine]))))
+    if not found:
         return None
-    return usual_rate(float(np.ptp(frame[good]) / np.ptp(seconds[good])))
+    long, count = max(found)
+    return usual_rate(count / long)
