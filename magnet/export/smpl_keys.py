@@ -51,8 +51,10 @@ OTHERS = {
 """By how many numbers a joint has: what they are, how that is told, and what to do. Nine come first: of a matrix's
 nine numbers six may look like two columns."""
 
+GENDER = "gender"
+
 LIKELY_PEOPLE = 20
-"""Of more people than these nobody has a file of fewer than a quarter as many frames: it has frames first."""
+"""More people than these with fewer than a quarter as many frames are frames first, unless shapes say otherwise."""
 
 
 class Unreadable(ValueError):
@@ -126,12 +128,29 @@ def _people_first(where: object, held: Mapping[str, Any], poses: Doubles) -> Dou
     if poses.ndim != 3 or {"body", "surface_model_type"} <= set(held):
         return poses
     first, second = poses.shape[:2]
-    if first > LIKELY_PEOPLE and first > 4 * second:
+    told = _people_told(held)
+    if first in told:
+        return poses
+    if second in told or (first > LIKELY_PEOPLE and first > 4 * second):
         raise Unreadable(
             f"{where}: rotations: got shape {poses.shape}, which is {first} people of {second} frames; people come "
-            "first: transpose the first two axes of all arrays that have both, as array.swapaxes(0, 1) does"
+            "first: transpose the first two axes of all arrays that have both, as array.swapaxes(0, 1) does; if they "
+            f"are {first} people, say so by shapes: {SHAPE[0]} ({first}, 10)"
         )
     return poses
+
+
+def _people_told(held: Mapping[str, Any]) -> set[int]:
+    """How many people there are, by what files have for each of them: shape numbers (P, 10) and genders (P,)."""
+    told = set()
+    for key, axes in (*((key, 2) for key in SHAPE), (GENDER, 1)):
+        try:
+            shape = np.shape(held.get(key, 0))
+        except ValueError:  # uneven lists, or pickled in a npz
+            continue
+        if len(shape) == axes:
+            told.add(shape[0])
+    return told
 
 
 def _require_vectors(where: object, array: Doubles) -> None:

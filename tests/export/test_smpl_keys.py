@@ -135,3 +135,31 @@ def test_people_first_are_read_also_if_there_are_many_or_they_are_short(count: i
     assert rotations("file", {"poses": poses}).shape == (count, frames, 72)
     ours = {"poses": poses[:, :1], "body": np.array("open-1"), "surface_model_type": np.array("smplx")}
     assert rotations("file", ours).shape == (count, 1, 72)
+
+
+@pytest.mark.parametrize(
+    "told", [{"betas": np.zeros((30, 10))}, {"shape": np.zeros((30, 16))}, {"gender": ["male"] * 30}]
+)
+def test_many_people_of_few_frames_are_read_where_shapes_or_genders_say_how_many(
+    told: dict[str, Any], tmp_path: Path
+) -> None:
+    poses, place = np.stack([vectors(72)[:5]] * 30), np.zeros((30, 5, 3))
+    assert rotations("file", {"poses": poses} | told).shape == (30, 5, 72)
+    with pytest.raises(Unreadable, match=r"if they are 30 people, say so by shapes: betas \(30, 10\)"):
+        rotations("file", {"poses": poses, "betas": np.zeros((30, 5, 10))})
+    path = tmp_path / "crowd.npz"
+    np.savez(path, poses=poses, trans=place, fps=30, **told)
+    assert read_smplx(path, load_body())[0].agents == 30
+    reader = ScenesReader(tmp_path)
+    prepared = reader.read(reader.found()[0]).poses
+    assert prepared is not None and prepared.shape[:2] == (5, 30)
+
+
+@pytest.mark.parametrize("told", [{"betas": np.zeros((2, 10))}, {"gender": np.array(["male", "female"])}])
+def test_few_frames_before_people_are_refused_where_shapes_or_genders_say_how_many(told: dict[str, Any]) -> None:
+    """They were taken for so many people."""
+    poses = np.stack([vectors(72)[:12]] * 2, axis=1)
+    with pytest.raises(Unreadable, match="which is 12 people of 2 frames; people come first: transpose"):
+        rotations("file", {"poses": poses} | told)
+    square = np.stack([vectors(72)[:2]] * 2)
+    assert rotations("file", {"poses": square} | told).shape == (2, 2, 72)
