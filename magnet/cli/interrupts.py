@@ -1,4 +1,4 @@
-"""Ctrl+C in a training: the first one ends it after the step that it is in, as SIGTERM does; the second one at once."""
+"""Ctrl+C or SIGTERM in a training: the first one ends it after the step that it is in, in all of its processes."""
 
 from __future__ import annotations
 
@@ -7,66 +7,126 @@ import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
+
+from magnet.cli.run_folder import LastCheckpoint
 
 INTERRUPTED, TERMINATED = 130, 143
 """Exit codes of a training that Ctrl+C or SIGTERM ended, as shells count them."""
+CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
 STOPPING = (
     "stopping after this step, and a validation if one is due or runs; Ctrl+C again stops at once, which loses the step"
 )
+TWICE = 2.0
+"""Seconds in which a second Ctrl+C is the first one again: torchrun passes on to its processes what they have got."""
 
 
 class EndOfStep(Callback):
-    """While steps are made in one process, lets the first SIGINT do what SIGTERM does: no batch is lost by it.
+    """While steps are made, lets the first SIGINT or SIGTERM end the training after the step: no batch is lost by it.
 
     A validation that is due after the step, or runs, is finished, too: a training that goes on would not repeat it.
-    Several processes get Ctrl+C each for itself, in different steps, so that it stops them at once.
+    Whoever says SIGTERM may not wait for it, so that a checkpoint is written first; a second SIGTERM cuts it short.
+    Of several processes any may be told, each in another step: after each step they agree, and end after the same one.
     """
 
     def __init__(self) -> None:
-        self.asked = False
-        self.before: Any = None
+        self.asked = 0  # the signal that this process has got
+        self.agreed = 0  # the signal that all know of
+        self.since = 0.0
+        self.before: dict[int, Any] = {}
+        self.steps = self.said = False
 
     @property
     def code(self) -> int:
         """Exit code of a training that was ended after a step."""
-        return INTERRUPTED if self.asked else TERMINATED
+        return CODES.get(self.agreed or self.asked, TERMINATED)  # type: ignore[call-overload]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        before, process = signal.getsignal(signal.SIGINT), os.getpid()
-        if not callable(before) or trainer.world_size > 1 or threading.current_thread() is not threading.main_thread():
+        self.steps = True
+        if threading.current_thread() is not threading.main_thread():
             return
+        process = os.getpid()
 
         def ask(number: int, frame: FrameType | None) -> None:
             if os.getpid() != process:  # of a process that reads data, which this one ends
                 return
-            self.asked = True
-            self._leave()
-            if not trainer.validating:
+            again, self.asked = bool(self.asked), self.asked or number
+            if again:
+                return self._again(trainer, number, frame)
+            self.since = time.monotonic()
+            if trainer.world_size == 1 and not trainer.validating:
+                self.agreed = self.asked
                 _end(trainer)
-            with contextlib.suppress(RuntimeError, OSError):  # what is being printed just now cannot be interrupted
+            self._say(trainer, number)
+
+        for number in CODES:
+            if callable(before := signal.getsignal(number)):
+                self.before[number] = before
+                signal.signal(number, ask)
+
+    def _say(self, trainer: Trainer, number: int) -> None:
+        """Tell once what happens now to whoever has pressed Ctrl+C."""
+        if number == signal.SIGINT and trainer.is_global_zero and not self.said:
+            self.said = True
+            with contextlib.suppress(RuntimeError, OSError):  # what is being printed now cannot be interrupted
                 print(STOPPING, file=sys.stderr, flush=True)
 
-        self.before = before
-        signal.signal(signal.SIGINT, ask)
+    def _again(self, trainer: Trainer, number: int, frame: FrameType | None) -> None:
+        """The second signal."""
+        several = trainer.world_size > 1
+        if number == signal.SIGTERM:
+            if not several:  # several would cut it short in different places, and wait for each other
+                _end(trainer)
+        elif not several or time.monotonic() - self.since > TWICE:
+            before = self.before[number]
+            self._leave()
+            before(number, frame)
 
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.asked:
-            _end(trainer, False)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.asked:
+    def _agree(self, trainer: Trainer) -> None:
+        """Hear what any of the processes was told; the training ends where one was."""
+        told = self.asked
+        if trainer.world_size > 1:
+            any_told = torch.tensor(told, device=trainer.strategy.root_device)
+            torch.distributed.all_reduce(any_told, torch.distributed.ReduceOp.MAX)
+            told = int(any_told)
+        self.agreed = told
+        if told:
+            self._say(trainer, told)
             _end(trainer)
 
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        self._agree(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.steps and self.agreed:
+            _end(trainer, False)
+            if self.agreed == signal.SIGTERM:
+                _save(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.steps:
+            self._agree(trainer)
+
     def _leave(self, *_: Any, **__: Any) -> None:
-        if self.before is not None:
-            signal.signal(signal.SIGINT, self.before)
-            self.before = None
+        for number, before in self.before.items():
+            signal.signal(number, before)
+        self.before = {}
+        self.steps = False
 
     on_train_end = on_exception = _leave
+
+
+def _save(trainer: Trainer) -> None:
+    for each in trainer.checkpoint_callbacks:
+        if isinstance(each, LastCheckpoint):
+            each.save(trainer)
 
 
 def _end(trainer: Trainer, asked: bool = True) -> None:

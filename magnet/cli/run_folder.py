@@ -159,9 +159,13 @@ class LastCheckpoint(ModelCheckpoint):
         super().__init__(place, *options, **more)
         self.place = place
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def save(self, trainer: Trainer) -> None:
+        """Save the last checkpoint as it is now; all processes of a training do so together."""
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(Path(str(self.dirpath)) / "last.ckpt")
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.save(trainer)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Save, but not where a run was refused before its first step; say how an interrupted training goes on."""

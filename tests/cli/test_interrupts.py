@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -100,12 +104,11 @@ def test_a_training_that_is_told_to_end_ends_after_the_step_and_goes_on_as_if_it
     assert cli.main(["fit", "--ckpt_path", "told/checkpoints/last.ckpt", "--out", "on", *HOW, *CPU]) == 0
     assert seen == [*range(6)]
     assert torch.equal(weights("on"), weights("whole"))
-    assert validated("whole") == [1, 3, 5]
-    if number == signal.SIGINT:  # who says SIGTERM may not wait for a validation
-        assert validated("told", "on") == [1, 3, 5]
+    assert validated("whole") == [1, 3, 5] == validated("told", "on")
 
 
-def test_a_validation_that_runs_is_finished_first(toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def tell_in_validation(monkeypatch: pytest.MonkeyPatch, number: int, times: int = 1) -> list[int]:
+    """Send a signal in the first batch of the first validation; the batches that are validated on from now on."""
     seen: list[int] = []
     plain = ToyModel.validation_step
 
@@ -113,13 +116,48 @@ def test_a_validation_that_runs_is_finished_first(toy: Path, monkeypatch: pytest
         seen.append(batch_idx)
         plain(self, rows, batch_idx)
         if len(seen) == 1:
-            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(times):
+                os.kill(os.getpid(), number)
 
     monkeypatch.setattr(ToyModel, "validation_step", step)
-    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 130
+    return seen
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_a_validation_that_runs_is_finished_first(number: int, toy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = tell_in_validation(monkeypatch, number)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == CODES[number]  # type: ignore[index]
     assert seen == [0, 1]
     assert validated("told") == [1]
     assert (toy / "told/checkpoints/best.ckpt").exists()
+
+
+def test_the_second_sigterm_cuts_a_validation_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = tell_in_validation(monkeypatch, signal.SIGTERM, times=2)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 143
+    assert seen == [0]
+    assert torch.load("told/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
+
+
+def test_before_a_validation_that_is_due_after_sigterm_a_checkpoint_is_written_that_goes_on(
+    toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever has said it may kill the training in the validation."""
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "whole"]) == 0
+    seen = tell(monkeypatch, signal.SIGTERM, 1)
+    plain = ToyModel.validation_step
+
+    def step(self: ToyModel, rows: Tensor, batch_idx: int) -> None:
+        plain(self, rows, batch_idx)
+        if not (toy / "left").exists():
+            shutil.copytree(toy / "told", toy / "left")
+
+    monkeypatch.setattr(ToyModel, "validation_step", step)
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 143
+    assert torch.load("left/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
+    assert cli.main(["fit", "--ckpt_path", "left/checkpoints/last.ckpt", "--out", "on", *HOW, *CPU]) == 0
+    assert seen == [*range(6)]
+    assert torch.equal(weights("on"), weights("whole"))
 
 
 def test_the_second_ctrl_c_stops_at_once(
@@ -159,3 +197,45 @@ def test_other_commands_end_at_once_by_ctrl_c(command: str, monkeypatch: pytest.
     monkeypatch.setattr(ToyModel, name, step)
     assert cli.main([command, "--ckpt_path", "whole/checkpoints/last.ckpt", *CPU]) == 1
     assert seen == [signal.default_int_handler]
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `tests.cli.stop_runs`."""
+    folder = tmp_path_factory.mktemp("several")
+    words = [sys.executable, "-m", "tests.cli.stop_runs", str(folder)]
+    root = Path(__file__).parents[2]
+    subprocess.run(words, cwd=root, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, timeout=550)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "steps", "code"),
+    [
+        ("one", 2, 130),
+        ("both", 1, 130),
+        ("passed on", 2, 130),
+        ("before a validation", 3, 130),
+        ("in a validation", 3, 130),
+        ("ended", 4, 143),
+        ("ended in a validation", 3, 143),
+    ],
+)
+def test_several_processes_of_which_any_is_told_end_after_one_step_and_go_on_as_if_they_had_not(
+    name: str, steps: int, code: int, several: Path
+) -> None:
+    codes = json.loads((several / "codes.json").read_text())
+    assert (codes["whole"], codes[name], codes[f"{name}, on"]) == ([0, 0], [code, code], [0, 0])
+
+    def last(run: str) -> dict[str, Any]:
+        found: dict[str, Any] = torch.load(several / run / "checkpoints/last.ckpt", weights_only=False)
+        return found
+
+    assert last(name)["global_step"] == steps
+    whole, gone_on = last("whole")["state_dict"], last(f"{name}, on")["state_dict"]
+    assert all(torch.equal(whole[key], gone_on[key]) for key in whole)
+    assert validated(str(several / name)) == ([2] if steps >= 3 else [])
+    said = (several / f"{name}.0.log").read_text()
+    assert said.count("stopping after this step") == (code == 130) and "goes on" in said
+    assert "stopping" not in (several / f"{name}.1.log").read_text()
