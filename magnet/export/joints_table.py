@@ -6,12 +6,13 @@ import csv
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.export.naming import recognised
 from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
 from magnet.export.table_times import (
     frames_by_time,
@@ -59,7 +60,8 @@ def read_table(path: str | Path) -> JointTable:
     `person` and `time_s`; others are passed over. Without `person` there is one, without `frame` rows are frames by
     their times, of several people those of one time are one frame; without `time_s`, too, they are frames in order, and
     the rate is not known. Times that go up by ones are numbers of frames. Cells may be empty, and a joint at 0, 0, 0 is
-    missing, too. Where frames or times tell of frames without a row, all joints are missing in them.
+    missing, too. Where frames or times tell of frames without a row, all joints are missing in them. Joints of people
+    may be side by side in a row, `A_left_hip_x` and `B_left_hip_x`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -108,7 +110,7 @@ def read_table(path: str | Path) -> JointTable:
     fps = None if seconds is None else _rate(seconds, frame, told)
     first = None if frame_at is None else int(numbers[:, frame_at].min())
     second = None if seconds is None else _first_time(seconds, frame, fps)
-    return JointTable(tuple(columns), people, at, fps, unit, step, first, second, told_in)
+    return _side_by_side(JointTable(tuple(columns), people, at, fps, unit, step, first, second, told_in))
 
 
 def _rows(path: Path) -> tuple[str, list[int], list[list[str]]]:
@@ -153,11 +155,45 @@ def _columns(path: Path, head: Sequence[str]) -> tuple[dict[str, list[int]], str
     if not whole:
         raise ValueError(
             f"{path}: no columns of joints, such as left_hip_x_m, left_hip_y_m, left_hip_z_m; it has "
-            f"{', '.join(head[:8])}{' ...' if len(head) > 8 else ''}"
+            f"{', '.join(head[:8])}{' ...' if len(head) > 8 else ''}{_instead(head)}"
         )
     if len(units) > 1:
         raise ValueError(f"{path}: its columns are in different units; bring them to one")
     return whole, units.pop()
+
+
+def _instead(head: Sequence[str]) -> str:
+    """What a table without three columns a joint seems to hold, and what to do, to end an error with."""
+    words = [name.lower() for name in head]
+    if set("xyz") <= set(words):
+        return "; a row for each joint is not read: make columns of them, a row for each frame and person"
+    axes = {
+        match[2].lower() for name in words if (match := COLUMN.match(name)) and name not in (*FRAME, *TIME, *PERSON)
+    }
+    return "; x and y alone are places in a picture: positions in space are needed" if {"x", "y"} == axes else ""
+
+
+def _side_by_side(table: JointTable) -> JointTable:
+    """Of a table that names nobody, people whose joints are side by side in a row: A_left_hip ... B_left_hip ...
+
+    Everybody has the same joints, whose names tell the sides by themselves, before or behind one word for each.
+    """
+    if table.people != ("",):
+        return table
+    for pattern in (r"(?P<who>.+?)[ _.:-]+(?P<joint>.+)", r"(?P<joint>.+)[ _.:-]+(?P<who>.+?)"):
+        parts = [re.fullmatch(pattern, name) for name in table.names]
+        if not all(parts):
+            continue
+        of: dict[str, dict[str, int]] = {}
+        for k, part in enumerate(parts):
+            assert part is not None
+            of.setdefault(part["who"], {})[part["joint"]] = k
+        (first, *others) = of.values()
+        alike = all(set(each) == set(first) for each in others) and len(first) * len(of) == len(parts)
+        if others and alike and not recognised(tuple(first)).missing:
+            at = np.stack([table.at[:, 0, [each[joint] for joint in first]] for each in of.values()], axis=1)
+            return replace(table, names=tuple(first), people=tuple(of), at=at)
+    return table
 
 
 def _number(path: Path, line: int, row: Sequence[str], k: int, sign: str) -> float:

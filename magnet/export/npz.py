@@ -297,6 +297,8 @@ def _require_keys(path: Path, there: Collection[str], ours: bool, in_fps: float 
         missing.insert(0, "betas")
     if missing:
         fix = "; say the frames a second: --in_fps 30 (in_fps=30)" if unrated else ""
+        if not whole and not first_of(PLACE, there):
+            fix = "; positions of joints are read from a table, .csv (docs/export.md)" + fix
         raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {', '.join(sorted(there))}{fix}")
 
 

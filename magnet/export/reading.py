@@ -17,6 +17,7 @@ from magnet.export.joints_read import load_joints
 from magnet.export.npz_files import is_ours, read_people
 from magnet.export.retarget import load_rigs, together
 from magnet.export.rig_files import RIGS
+from magnet.export.unread import advice_for
 from magnet.export.upright import WARNING
 from magnet.files import regular
 from magnet.motion.resample import resampled
@@ -103,6 +104,7 @@ def read(
         rigs = ", ".join(RIGS)
         raise ValueError(
             f"cannot read {names}: expected .npz or {TABLE} files alone, or files of skeletons ({rigs}){only}"
+            f"{advice_for(suffixes)}"
         )
     for file in files:
         if not file.exists():

@@ -54,6 +54,8 @@ def test_columns_that_merely_end_in_an_axis_or_could_be_a_person_are_passed_over
     ("lines", "said"),
     [
         (["a,b", "1,2"], "no columns of joints, such as left_hip_x_m, left_hip_y_m, left_hip_z_m; it has a, b"),
+        (["frame,joint,x,y,z", "0,hip,1,2,3"], "a row for each joint is not read: make columns of them"),
+        (["frame,a_x,a_y", "0,1,2"], "x and y alone are places in a picture: positions in space are needed"),
         (["a_x,a_y,a_z"], "holds no rows under a line of names"),
         (["a_x,a_y,a_z", "1,2"], "line 2: 2 cells, fewer than names"),
         (["frame,a_x,a_y,a_z", "1,0,0,0", "1,0,0,0"], "line 3: a second row for frame 0; is a column person missing"),
@@ -177,3 +179,34 @@ def test_times_of_whole_seconds_are_seconds(counted: str, start: int, tmp_path: 
     rows = [f"{counted and f'{k},'}{start + k // 30},1,2,3" for k in range(121)]
     found = read_table(table(tmp_path / "a.csv", f"{counted}timestamp,a_x,a_y,a_z", *rows))
     assert (found.fps, len(found.at), found.told) == (30.0, 121, "")
+
+
+SIDES = [
+    f"{side}_{part}" for side in ("left", "right") for part in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+]
+
+
+@pytest.mark.parametrize(
+    "name", ["{who}_{joint}_{axis}", "{who}:{joint}.{axis}", "{joint}_{who}_{axis}", "{axis}_{who}_{joint}"]
+)
+@pytest.mark.parametrize("order", ["people first", "joints first"])
+def test_people_may_be_side_by_side_in_a_row(name: str, order: str, tmp_path: Path) -> None:
+    pairs = [(who, joint) for who in ("anna", "ben") for joint in SIDES]
+    pairs = pairs if order == "people first" else sorted(pairs, key=lambda pair: SIDES.index(pair[1]))
+    head = [name.format(who=who, joint=joint, axis=axis) for who, joint in pairs for axis in "xyz"]
+    at = {pair: [100 * (pair[0] == "ben") + SIDES.index(pair[1]) + 1, 2, 3] for pair in pairs}
+    row = ",".join(str(number) for pair in pairs for number in at[pair])
+    found = read_table(table(tmp_path / "a.csv", "time," + ",".join(head), f"0,{row}", f"0.04,{row}"))
+    assert found.people == ("anna", "ben") and set(found.names) == set(SIDES) and found.fps == 25.0
+    for p, who in enumerate(found.people):
+        assert found.at[1, p].tolist() == [at[who, joint] for joint in found.names]
+
+
+def test_sides_are_no_people_and_who_has_other_joints_is_not_beside(tmp_path: Path) -> None:
+    def named(names: list[str]) -> tuple[str, ...]:
+        head = ",".join(f"{name}_{axis}" for name in names for axis in "xyz")
+        return read_table(table(tmp_path / "a.csv", head, ",".join(["1"] * 3 * len(names)))).people
+
+    assert named(SIDES) == ("",)
+    assert named([f"rig_{name}" for name in SIDES]) == ("",)
+    assert named([f"{who}_{name}" for who in "AB" for name in SIDES] + ["A_neck"]) == ("",)

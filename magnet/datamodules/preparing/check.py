@@ -21,7 +21,7 @@ from magnet.datamodules.preparing.pack import split_counts
 from magnet.datamodules.preparing.prepare import absent_note, select_takes, summary_of
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own import FEW, OwnReader, seconds_needed
-from magnet.datamodules.reading.own_files import of_tables
+from magnet.datamodules.reading.own_files import of_others
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import StoreError, StoreReader, StoreSplit, body_hash
 from magnet.datamodules.store.rows import SCALE, scene_of
@@ -194,7 +194,7 @@ def recognise(root: Path) -> str:
         raise ValueError(f"{root} could be {' or '.join(found)}: say which with --name{alone}")
     raise ValueError(
         f"{root} is neither a prepared store nor a download that is known; it holds {listing(root)}; give "
-        f"another folder, or say which data set it should be with --name, to be told what is missing{of_tables(root)}"
+        f"another folder, or say which data set it should be with --name, to be told what is missing{of_others(root)}"
     )
 
 

@@ -21,7 +21,7 @@ from magnet.datamodules.reading.own_files import (
     by_pattern,
     by_table,
     files_of,
-    of_tables,
+    of_others,
 )
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.export.cutting import rates_note
@@ -108,7 +108,7 @@ class OwnReader(Reader, Generic[T]):
             kinds = " or ".join(self.suffixes)
             raise DataError(
                 f"{self.root}: no {kinds} file; it holds {listing(self.root)}; give the folder that has them"
-                f"{of_tables(self.root)}"
+                f"{of_others(self.root)}"
             )
         if pattern is not None:
             by_pattern(self.root, (), pattern)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from magnet.datamodules.reading.fields import natural
 from magnet.datamodules.reading.recording import DataError
+from magnet.export.unread import ADVICE, advice_for
 from magnet.files import said_sign
 
 TABLE = "people.csv"
@@ -73,11 +74,11 @@ def files_of(root: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(found, key=lambda path: (natural(path.relative_to(root).as_posix()), path.as_posix()))
 
 
-def of_tables(root: Path) -> str:
-    """How tables of joint positions under a folder become files that are read, to end an error with; "" of none."""
+def of_others(root: Path) -> str:
+    """How other files of motion under a folder become files that are read, to end an error with; "" of none."""
     tables = [path for path in files_of(root, (".csv",)) if path.name != TABLE]
     if not tables:
-        return ""
+        return advice_for(path.suffix.lower() for path in files_of(root, tuple(ADVICE)))
     return (
         f"; of tables of joint positions make scenes first, one by one: magnet export {tables[0].name} "
         f"scenes/{tables[0].stem}.npz, then magnet data prepare scenes --root scenes store (docs/own.md)"
