@@ -9,6 +9,7 @@ from typing import Any
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
+from magnet.body.joints import HIPS
 from magnet.checks import require_flag, require_number, require_whole
 from magnet.export.cutting import rates_note, shared_frames
 from magnet.export.formats import MOST_FPS, WRITTEN
@@ -21,6 +22,7 @@ from magnet.export.unread import advice_for
 from magnet.export.upright import WARNING
 from magnet.files import regular
 from magnet.motion.resample import resampled
+from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
 
 TABLE = ".csv"
@@ -28,6 +30,10 @@ READ = (".npz", *RIGS, TABLE)
 """Suffixes that can be read."""
 UNSEEN = 0.0005
 """Metres by which people are moved without a word."""
+STILL, STEPS, LONG = 0.015, 0.3, 2.0
+"""Metres over the ground in which a pelvis stays, and radians through which both thighs swing, for so many seconds or
+more, of nobody in their own place: of CMU's takes, in 1,493 stretches of two seconds, who swings them so goes 3.6 cm
+or more, and who stays swings them by 0.16 at most."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +127,7 @@ def read(
         if abs(imported.floor) >= UNSEEN:
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
             notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
-        return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body)))
+        return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body), *in_place(imported.scene)))
     if options.clip is not None:
         raise ValueError(f"{files[0]}: clip: chooses an animation of a .glb")
     if suffixes == {TABLE}:
@@ -199,7 +205,7 @@ def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[
             far = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"
             notes = [*notes, f"everybody was {way} by {far} onto the floor; --keep_floor leaves them"]
         heights = standing(lowest(moved, body), counting(moved)).flatten().tolist() if moved.frames else []
-        notes = [*notes, *(off_their_floor(heights) if moved.scenes == 1 else [])]
+        notes = [*notes, *(off_their_floor(heights) if moved.scenes == 1 else []), *in_place(moved)]
         return Read(moved, body, tuple(notes))
     return Read(scene, body, (*notes, *_floor_note(scene, body)))
 
@@ -210,3 +216,21 @@ def _floor_note(scene: Scene, body: Body) -> list[str]:
         return []
     where = f"{abs(metres):.2f} m {'over' if metres > 0 else 'under'} y = 0, where models have their floor"
     return [f"everybody stands {where}; `magnet export --on_floor` puts them on it"]
+
+
+def in_place(scene: Scene) -> list[str]:
+    """A warning of people whose legs walk and whose pelvis stays where it is, as programs export motion in place."""
+    if scene.frames < LONG * scene.fps:
+        return []
+    over = scene.T_world_root[..., [0, 2], 3]
+    still = ((over.amax(dim=1) - over.amin(dim=1)) < STILL).all(dim=-1)  # (B, P)
+    hips = [joint - 1 for joint in HIPS]  # `body_rot` lacks the pelvis
+    swing = to_rotvec(scene.body_rot[:, :1, :, hips].mT @ scene.body_rot[:, :, :, hips]).norm(dim=-1).amax(dim=1)
+    found = (still & (swing > STEPS).all(dim=-1) & scene.present).any(dim=0).nonzero()[:, 0].tolist()
+    if not found:
+        return []
+    who = f"person {found[0]}" if len(found) == 1 else f"people {', '.join(map(str, found))}"
+    return [
+        f"{WARNING}{who}: legs walk but the pelvis stays in one place; if that was exported so, export it again with "
+        "the movement of the root"
+    ]
