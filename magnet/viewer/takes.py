@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -49,6 +50,9 @@ def read_takes(
     if len(rates) > 1:
         listed = ", ".join(f"{path.name} has {fps:g}" for fps, path in rates.items())
         raise ValueError(f"mixed frame rates (frames a second): {listed}; show files of one rate at a time")
+    if len(paths) > 1 and all(int(each.scene.present.sum()) == 1 for _, each in found):
+        together = f"magnet export {shlex.join(map(str, paths))} together.npz"
+        say(f"each file is a scene of its own; if they are people of one: {together}, then view it")
     return [each for _, each in found], body
 
 

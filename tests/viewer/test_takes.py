@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from magnet.body import Body
+from magnet.export.formats import write
 from magnet.export.npz import save_smplx
 from magnet.export.page.takes import numbered, same_length, take, takes
 from magnet.export.reading import Reading
@@ -134,3 +135,19 @@ def test_other_npz_files_are_refused_with_what_they_hold(tmp_path: Path, body: B
     np.savez(path, cats=np.zeros(3), meta=np.array(json.dumps({})))
     with pytest.raises(ValueError, match=r"other\.npz"):
         read_takes([path], body)
+
+
+def test_files_of_one_person_each_are_scenes_of_their_own_which_is_said(
+    tmp_path: Path, duet: Scene, body: Body
+) -> None:
+    said: list[str] = []
+    alone = [write(duet.permute_agents(torch.tensor([p])), tmp_path / f"a {p}.bvh", body)[0] for p in (0, 1)]
+    found, _ = read_takes(alone, body, say=said.append)
+    assert [each.scene.agents for each in found] == [1, 1]
+    words = f"magnet export '{alone[0]}' '{alone[1]}' together.npz"
+    assert said[-1] == f"each file is a scene of its own; if they are people of one: {words}, then view it"
+    both = write(duet, tmp_path / "both.npz", body)[0]
+    for paths in ([alone[0]], [both, alone[0]]):
+        said.clear()
+        read_takes(paths, body, say=said.append)
+        assert not any("scene of its own" in line for line in said)
