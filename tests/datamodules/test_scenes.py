@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -324,11 +325,10 @@ def test_a_folder_of_tables_of_joints_is_told_the_way_by_which_it_is_prepared(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     made = synthesize("follow", 2, 120, torch.Generator().manual_seed(1), load_body()).scene
-    save_csv(made, "dl/a.csv", load_body())
+    save_csv(made, "dl/a take.csv", load_body())
     for words in (["check", "dl"], ["prepare", "scenes", "--root", "dl", "store"]):
         assert cli.main(["data", *words]) == 2
         said = capsys.readouterr().err.split("of tables of joint positions make scenes first, one by one: magnet ")[1]
         first, then = said.split(" (docs/own.md)")[0].split(", then magnet ")
-    monkeypatch.chdir("dl")
-    assert cli.main(first.split()) == 0 and cli.main([*then.split(), "--workers", "1"]) == 0
+    assert cli.main(shlex.split(first)) == 0 and cli.main([*then.split(), "--workers", "1"]) == 0
     assert "1 scene" in capsys.readouterr().out

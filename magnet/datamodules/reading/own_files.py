@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -79,9 +80,10 @@ def of_others(root: Path) -> str:
     tables = [path for path in files_of(root, (".csv",)) if path.name != TABLE]
     if not tables:
         return advice_for(path.suffix.lower() for path in files_of(root, tuple(ADVICE)))
+    export = shlex.join(["magnet", "export", str(tables[0]), f"scenes/{tables[0].stem}.npz"])
     return (
-        f"; of tables of joint positions make scenes first, one by one: magnet export {tables[0].name} "
-        f"scenes/{tables[0].stem}.npz, then magnet data prepare scenes --root scenes store (docs/own.md)"
+        f"; of tables of joint positions make scenes first, one by one: {export}, then magnet data prepare scenes "
+        "--root scenes store (docs/own.md)"
     )
 
 
