@@ -5,21 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 
-from magnet.datamodules.clip import Split
+from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_split, listed_splits, open_names, require
-from magnet.datamodules.reading.fields import PersonMotion, listing, mapping, side_by_side
+from magnet.datamodules.reading.fields import PersonMotion, listing, pickled_mapping, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
-from magnet.unpickle import load_pickle
 
 LARGEST = 7
 LIST = "split_sequence_names.txt"
-LISTS: tuple[Split, ...] = ("train", "val", "test")
 SHAPELESS = "no shapes in this data set: everybody has the body's mean shape"
 
 
@@ -37,13 +35,13 @@ class AIOZReader(Reader):
         DataError: no motions; says what was found.
     """
 
-    name: ClassVar[str] = "aioz"
-    title: ClassVar[str] = "AIOZ-GDANCE"
-    source: ClassVar[str] = "https://github.com/aioz-ai/AIOZ-GDANCE"
-    licence: ClassVar[str] = "non-commercial scientific research only"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.aioz"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "aioz"
+    title = "AIOZ-GDANCE"
+    source = "https://github.com/aioz-ai/AIOZ-GDANCE"
+    licence = "non-commercial scientific research only"
+    fake = "magnet.datamodules.fakes.aioz"
+    family = "smpl"
+    layout = (
         ("motions_smpl/NAME.pkl", "one file a sequence"),
         ("{train,val,test}_split_sequence_names.txt", "the official lists"),
     )
@@ -61,7 +59,7 @@ class AIOZReader(Reader):
 
     def official(self) -> dict[str, Split]:
         """By the lists, or else by a hash of the video."""
-        lists = {split: self.root / f"{split}_{LIST}" for split in LISTS}
+        lists = {split: self.root / f"{split}_{LIST}" for split in SPLITS}
         if any(path.is_file() for path in lists.values()):
             return listed_splits(lists, _listed)
         names = {take.name for take in self.found()}
@@ -73,7 +71,7 @@ class AIOZReader(Reader):
     def read(self, take: Take) -> Recording:
         """All dancers at 30 fps, y up, of the mean shape."""
         (path,) = take.files
-        said = mapping(path, load_pickle(path))
+        said = pickled_mapping(path)
         require(path, said, ("smpl_poses", "root_trans"))
         trans = floats(f"{path}: root_trans", said["root_trans"], ("people", "T", 3))
         if len(trans) > LARGEST:
@@ -119,7 +117,7 @@ class AIOZ(Prepared):
         **kwargs: as for Prepared.
     """
 
-    reader: ClassVar[type[Reader]] = AIOZReader
+    reader = AIOZReader
 
     def __init__(self, path: str = "", max_agents: int = 7, **kwargs: Any) -> None:
         super().__init__(path=path, max_agents=max_agents, **kwargs)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from magnet.datamodules.reading.arrays import AGAIN, gap_note
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import DataError
@@ -27,11 +25,11 @@ class BVHReader(RigReader):
         ValueError: a line of `joints` that is no pair of names, or a pattern that is none.
     """
 
-    name: ClassVar[str] = "bvh"
-    title: ClassVar[str] = "BVH files"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.bvh"
-    suffixes: ClassVar[tuple[str, ...]] = (".bvh",)
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "bvh"
+    title = "BVH files"
+    fake = "magnet.datamodules.fakes.bvh"
+    suffixes = (".bvh",)
+    layout = (
         ("NAME_{A,B}.bvh", "a person each, of any skeleton; other ways to say who is together are in docs/own.md"),
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -38,15 +37,13 @@ class CHI3DReader(Reader):
         DataError: no such folder; says what was found.
     """
 
-    name: ClassVar[str] = "chi3d"
-    title: ClassVar[str] = "CHI3D"
-    source: ClassVar[str] = "http://vision.imar.ro/ci3d"
-    licence: ClassVar[str] = "non-commercial research only, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.chi3d"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("chi3d/train/sXX/smplx/ACTION.json", "both people; train may lie in --root itself"),
-    )
+    name = "chi3d"
+    title = "CHI3D"
+    source = "http://vision.imar.ro/ci3d"
+    licence = "non-commercial research only, by form; no redistribution"
+    fake = "magnet.datamodules.fakes.chi3d"
+    family = "smplx"
+    layout = (("chi3d/train/sXX/smplx/ACTION.json", "both people; train may lie in --root itself"),)
 
     def __init__(self, root: str | Path, test_pairs: Sequence[str] = ("s03",)) -> None:
         super().__init__(root)
@@ -105,4 +102,4 @@ def axis_angle(where: object, matrices: Doubles) -> Doubles:
 class CHI3D(Prepared):
     """CHI3D from a store that `magnet data prepare chi3d` made: scenes of two people."""
 
-    reader: ClassVar[type[Reader]] = CHI3DReader
+    reader = CHI3DReader

@@ -40,8 +40,8 @@ class Clip:
     split: Split
 
     def __post_init__(self) -> None:
-        if self.split not in get_args(Split):
-            raise ValueError(f"clip {self.name}: got split {self.split!r}, expected one of {get_args(Split)}")
+        if self.split not in SPLITS:
+            raise ValueError(f"clip {self.name}: got split {self.split!r}, expected one of {SPLITS}")
         if self.scene.scenes != 1 or not self.scene.frames or not self.scene.agents:
             shape = tuple(self.scene.T_world_root.shape[:3])
             raise ValueError(f"clip {self.name}: got (B, T, P) = {shape}, expected one scene with frames and agents")

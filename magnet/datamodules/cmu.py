@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from lightning.pytorch.utilities import rank_zero_warn
 
@@ -19,7 +19,7 @@ from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import Glitches, check_rate, measured
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
 from magnet.datamodules.reading.fields import listing
-from magnet.datamodules.reading.recording import DataError, Family, Reader, Recording, Take
+from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
 from magnet.datamodules.store.memory import MemoryStore
 from magnet.datamodules.store.reader import StoreSplit
@@ -61,13 +61,13 @@ class CMUReader(Reader):
         ValueError: a take is in two splits.
     """
 
-    name: ClassVar[str] = "cmu"
-    title: ClassVar[str] = "CMU Graphics Lab Motion Capture Database"
-    source: ClassVar[str] = "http://mocap.cs.cmu.edu"
-    licence: ClassVar[str] = "free for research and products; not to be sold or passed on, converted or not"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.cmu"
-    family: ClassVar[Family] = "positions"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "cmu"
+    title = "CMU Graphics Lab Motion Capture Database"
+    source = "http://mocap.cs.cmu.edu"
+    licence = "free for research and products; not to be sold or passed on, converted or not"
+    fake = "magnet.datamodules.fakes.cmu"
+    family = "positions"
+    layout = (
         ("NN.asf", "a subject's skeleton, such as 60.asf, in any folder"),
         ("NN_NN.amc", "a subject's take, such as 60_05.amc; of couples both"),
     )
@@ -223,7 +223,7 @@ class CMU(Prepared):
         ValueError: a take is in two splits, or a store is given beside what is for recordings.
     """
 
-    reader: ClassVar[type[Reader] | None] = CMUReader
+    reader = CMUReader
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,14 +16,13 @@ from magnet.datamodules.reading.fields import (
     first_folder,
     gender_of,
     listing,
-    mapping,
+    pickled_mapping,
     rows,
     shape_numbers,
     side_by_side,
 )
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
-from magnet.unpickle import load_object_npy
 
 RATE = 30.0
 ROLES = ("follower", "leader")
@@ -49,19 +48,19 @@ class DD100Reader(Reader):
         DataError: there are no such files under root.
     """
 
-    name: ClassVar[str] = "dd100"
-    title: ClassVar[str] = "DD100"
-    source: ClassVar[str] = "https://github.com/lisiyao21/Duolando"
-    licence: ClassVar[str] = "NTU S-Lab License 1.0: non-commercial"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.dd100"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "dd100"
+    title = "DD100"
+    source = "https://github.com/lisiyao21/Duolando"
+    licence = "NTU S-Lab License 1.0: non-commercial"
+    fake = "magnet.datamodules.fakes.dd100"
+    family = "smplx"
+    layout = (
         (
             "data/motion/smplx/all/GENRE_CHOREO_TAKE_{00,01}.npy",
             "00 the follower, 01 the leader, such as Jive_005_001_00.npy",
         ),
     )
-    version: ClassVar[int] = 2  # genders are read
+    version = 2  # genders are read
 
     def __init__(
         self, root: str | Path, validation: bool = True, orient: Literal["same", "global_orient", "poses"] = "same"
@@ -106,7 +105,7 @@ class DD100Reader(Reader):
         return side_by_side(self.folder / take.name, people, RATE, "+z", cut=True)
 
     def _person(self, path: Path, role: str) -> PersonMotion:
-        held = mapping(path, load_object_npy(path))
+        held = pickled_mapping(path)
         poses, transl = rows(path, held, "poses", 165), rows(path, held, "transl", 3)
         lengths = {"poses": len(poses), "transl": len(transl)}
         if self.orient != "poses" and ("global_orient" in held or self.orient == "global_orient"):
@@ -130,4 +129,4 @@ class DD100Reader(Reader):
 class DD100(Prepared):
     """Couples of DD100, from a store that `magnet data prepare dd100` made."""
 
-    reader: ClassVar[type[Reader]] = DD100Reader
+    reader = DD100Reader

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import one_length
-from magnet.datamodules.reading.fields import first_folder, listing, mapping, natural, person, rows, side_by_side
+from magnet.datamodules.reading.fields import (
+    first_folder,
+    listing,
+    mapping,
+    natural,
+    person,
+    pickled_mapping,
+    rows,
+    side_by_side,
+)
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
-from magnet.unpickle import load_object_npy, load_pickle
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP,
@@ -21,6 +31,7 @@ from magnet.body.joints import (  # isort: skip
 )  # fmt: skip
 
 RATE = 120.0
+Form = Literal["auto", "fit", "skeleton"]
 THINNING, UNIT, SKIPPED = 4, 4, 4
 """120 to 30 fps; frames that the authors' parts are multiples of; frames before their first, whose speed is unknown."""
 TRAIN, VALIDATION = 0.8, 0.1
@@ -28,6 +39,12 @@ TRAIN, VALIDATION = 0.8, 0.1
 PARTS: dict[str, Split] = {"tr": "train", "va": "val", "te": "test"}
 PLACES = ("", "DuoBox", "data/DuoBox")
 FITS, SKELETONS = "fbx_fit_smpl", "fbx_export_joints"
+FILES: dict[Form, tuple[str, ...]] = {
+    "auto": (f"{SKELETONS}/*.npy", f"{FITS}/*.pkl", f"{FITS}/*.npy"),
+    "fit": (f"{FITS}/*.pkl", f"{FITS}/*.npy"),
+    "skeleton": (f"{SKELETONS}/*.npy",),
+}
+"""Of a take that several have, the last one's file is read."""
 
 MOTIVE = (
     "Hips", "Spine", "Spine1", "Neck", "Head", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder",
@@ -63,13 +80,13 @@ class DuoBoxReader(Reader):
         DataError: neither folder is there.
     """
 
-    name: ClassVar[str] = "duobox"
-    title: ClassVar[str] = "DuoBox"
-    source: ClassVar[str] = "https://github.com/zju3dv/ready_to_react"
-    licence: ClassVar[str] = "by request form, no licence published: research only, no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.duobox"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "duobox"
+    title = "DuoBox"
+    source = "https://github.com/zju3dv/ready_to_react"
+    licence = "by request form, no licence published: research only, no redistribution"
+    fake = "magnet.datamodules.fakes.duobox"
+    family = "smplx"
+    layout = (
         ("fbx_fit_smpl/TAKE.npy", "SMPL-X fits of both people"),
         ("fbx_export_joints/TAKE.npy", "their skeletons, for takes without a fit"),
     )
@@ -77,12 +94,12 @@ class DuoBoxReader(Reader):
     def __init__(
         self,
         root: str | Path,
-        form: Literal["auto", "fit", "skeleton"] = "auto",
+        form: Form = "auto",
         phases: int = 4,
         validation: bool = True,
     ) -> None:
         super().__init__(root)
-        if form not in ("auto", "fit", "skeleton"):
+        if form not in FILES:
             raise DataError(f"form: got {form!r}, expected 'auto', 'fit' or 'skeleton': give one of them")
         if not 1 <= phases <= THINNING:
             raise DataError(f"phases: got {phases}, expected 1 to {THINNING}: give one of them")
@@ -98,11 +115,7 @@ class DuoBoxReader(Reader):
 
     def found(self) -> list[Take]:
         """Every file's parts and phases."""
-        files: dict[str, Path] = {}
-        if self.form != "fit":
-            files |= {path.stem: path for path in sorted((self.folder / SKELETONS).glob("*.npy"))}
-        if self.form != "skeleton":
-            files |= {path.stem: path for ending in ("pkl", "npy") for path in self._fits(ending)}
+        files = {path.stem: path for pattern in FILES[self.form] for path in sorted(self.folder.glob(pattern))}
         parts = [f"tr{phase}" for phase in range(self.phases)] + ["va0"] * self.validation + ["te0"]
         return [
             Take(f"{name}_{part}", (files[name],), PARTS[part[:2]], group=f"{name}_{part[:2]}")
@@ -110,32 +123,21 @@ class DuoBoxReader(Reader):
             for part in parts
         ]
 
-    def _fits(self, ending: str) -> list[Path]:
-        return sorted((self.folder / FITS).glob(f"*.{ending}"))
-
     def read(self, take: Take) -> Recording:
         """One part and phase of a take at 120 fps, z up; the authors use every fourth frame."""
         path, part = take.files[0], take.name.rsplit("_", 1)[-1]
-        held = mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path))
+        held = pickled_mapping(path)
         if path.parent.name == SKELETONS:
-            return self._skeleton(path, dict(held), part)
+            return self._skeleton(path, held, part)
         if len(held) != 2:
             raise DataError(f"{path}: holds {', '.join(held) or 'nobody'}, expected two people by name")
         people = [person(f"{path}, {name}", mapping(f"{path}, {name}", one), name) for name, one in held.items()]
         whole = side_by_side(path, people, RATE, "+z")
         assert whole.poses is not None and whole.transl is not None
         shown = self.frames(path, whole.frames, part)
-        return Recording(
-            fps=RATE,
-            up="+z",
-            poses=whole.poses[shown],
-            transl=whole.transl[shown],
-            betas=whole.betas,
-            persons=whole.persons,
-            notes=whole.notes,
-        )
+        return replace(whole, poses=whole.poses[shown], transl=whole.transl[shown])
 
-    def _skeleton(self, path: Path, held: dict[str, Any], part: str) -> Recording:
+    def _skeleton(self, path: Path, held: Mapping[str, Any], part: str) -> Recording:
         names = tuple(key.removesuffix("_position") for key in held if key.endswith("_position"))
         if len(names) != 2:
             raise DataError(
@@ -180,4 +182,4 @@ class DuoBoxReader(Reader):
 class DuoBox(Prepared):
     """Boxing couples of DuoBox, from a store that `magnet data prepare duobox` made."""
 
-    reader: ClassVar[type[Reader]] = DuoBoxReader
+    reader = DuoBoxReader

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,13 +72,13 @@ class Embody3DReader(Reader):
         DataError: a section is not there.
     """
 
-    name: ClassVar[str] = "embody3d"
-    title: ClassVar[str] = "Embody 3D"
-    source: ClassVar[str] = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
-    licence: ClassVar[str] = "Meta's XRCIA research licence, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.embody3d"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "embody3d"
+    title = "Embody 3D"
+    source = "https://www.meta.com/emerging-tech/codec-avatars/embody-3d"
+    licence = "Meta's XRCIA research licence, by form; no redistribution"
+    fake = "magnet.datamodules.fakes.embody3d"
+    family = "smplx"
+    layout = (
         ("datasets/SECTION/CAPTURE/SUBJECT/FEATURE/CAPTURE.npy", "features smplx_mesh_* and missing"),
         ("datasets/SECTION/dataset.json", "the list of each section, from the toolbox"),
     )
@@ -244,7 +244,7 @@ class Embody3D(Prepared):
         **kwargs: as for Prepared.
     """
 
-    reader: ClassVar[type[Reader]] = Embody3DReader
+    reader = Embody3DReader
 
     def __init__(self, path: str = "", max_agents: int = 4, **kwargs: Any) -> None:
         super().__init__(path=path, max_agents=max_agents, **kwargs)

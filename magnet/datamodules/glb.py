@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import ClassVar
 
 from magnet.datamodules.reading.own import require_alone
 from magnet.datamodules.reading.own_files import PersonFile
@@ -30,14 +29,14 @@ class GLBReader(RigReader):
         ValueError: a line of `joints` that is no pair of names, or a pattern that is none.
     """
 
-    name: ClassVar[str] = "glb"
-    title: ClassVar[str] = "GLB, glTF, VRM animation and FBX files"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.glb"
-    suffixes: ClassVar[tuple[str, ...]] = (".glb", ".gltf", ".vrma", ".fbx")
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "glb"
+    title = "GLB, glTF, VRM animation and FBX files"
+    fake = "magnet.datamodules.fakes.glb"
+    suffixes = (".glb", ".gltf", ".vrma", ".fbx")
+    layout = (
         ("NAME.glb", "everybody of a scene, of any skeletons; or a person each, and .gltf, .vrma, .fbx (docs/own.md)"),
     )
-    one_person_a_file: ClassVar[bool] = False
+    one_person_a_file = False
 
     def open(self, person_file: PersonFile, alone: bool) -> tuple[list[RigTrack], list[str]]:
         """The people in a file."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 
@@ -35,17 +35,17 @@ class Hi4DReader(Reader):
         ValueError: a pair is in two splits.
     """
 
-    name: ClassVar[str] = "hi4d"
-    title: ClassVar[str] = "Hi4D"
-    source: ClassVar[str] = "https://yifeiyin04.github.io/Hi4D"
-    licence: ClassVar[str] = "non-commercial scientific research only, by form; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.hi4d"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "hi4d"
+    title = "Hi4D"
+    source = "https://yifeiyin04.github.io/Hi4D"
+    licence = "non-commercial scientific research only, by form; no redistribution"
+    fake = "magnet.datamodules.fakes.hi4d"
+    family = "smpl"
+    layout = (
         ("pairXX/ACTION/meta.npz", "first and last frame, genders"),
         ("pairXX/ACTION/smpl/FRAME.npz", "one file a frame, both people"),
     )
-    version: ClassVar[int] = 2  # genders are read
+    version = 2  # genders are read
 
     def __init__(
         self, root: str | Path, test_pairs: Sequence[int] = (28, 32, 37), val_pairs: Sequence[int] = (23, 27)
@@ -128,4 +128,4 @@ class Hi4DReader(Reader):
 class Hi4D(Prepared):
     """Hi4D from a store that `magnet data prepare hi4d` made: scenes of two people."""
 
-    reader: ClassVar[type[Reader]] = Hi4DReader
+    reader = Hi4DReader

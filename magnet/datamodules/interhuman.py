@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 
-from magnet.datamodules.clip import Split
+from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
-from magnet.datamodules.reading.fields import listing, mapping, natural, person, side_by_side
+from magnet.datamodules.reading.fields import listing, mapping, natural, person, pickled_mapping, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
-from magnet.unpickle import load_pickle
 
 RATE = 59.94
 PEOPLE = ("person1", "person2")
-LISTS: tuple[Split, ...] = ("train", "val", "test")
 
 
 class InterHumanReader(Reader):
@@ -35,18 +33,18 @@ class InterHumanReader(Reader):
         DataError: no motions; says what was found.
     """
 
-    name: ClassVar[str] = "interhuman"
-    title: ClassVar[str] = "InterHuman"
-    source: ClassVar[str] = "https://github.com/tr3e/InterGen"
-    licence: ClassVar[str] = "CC BY-NC-SA 4.0, by request; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.interhuman"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smpl"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "interhuman"
+    title = "InterHuman"
+    source = "https://github.com/tr3e/InterGen"
+    licence = "CC BY-NC-SA 4.0, by request; no redistribution"
+    fake = "magnet.datamodules.fakes.interhuman"
+    family = "smpl"
+    layout = (
         ("motions/ID.pkl", "the raw motions, not motions_processed"),
         ("split/{train,val,test,ignore_list}.txt", "the official lists"),
     )
-    shapes_of: ClassVar[tuple[str, ...]] = ("smplh", "smpl")
-    version: ClassVar[int] = 2  # genders are read
+    shapes_of = ("smplh", "smpl")
+    version = 2  # genders are read
 
     def __init__(self, root: str | Path, fps: float = RATE) -> None:
         super().__init__(root)
@@ -68,7 +66,7 @@ class InterHumanReader(Reader):
             raise DataError(
                 f"{self.root / 'split'}: no train.txt; put the download's lists train, val and test there{OR_YOURS}"
             )
-        splits = listed_splits({split: folder / f"{split}.txt" for split in LISTS})
+        splits = listed_splits({split: folder / f"{split}.txt" for split in SPLITS})
         ignored = folder / "ignore_list.txt"
         for name in open_names(ignored) if ignored.is_file() else ():
             splits.pop(name, None)
@@ -77,7 +75,7 @@ class InterHumanReader(Reader):
     def read(self, take: Take) -> Recording:
         """Both people at 59.94 fps, z up."""
         (path,) = take.files
-        said = mapping(path, load_pickle(path))
+        said = pickled_mapping(path)
         if lacking := [name for name in PEOPLE if said.get(name) is None]:
             raise DataError(
                 f"{path}: the partner {' and '.join(lacking)} is missing; it has {', '.join(said)}; {AGAIN}"
@@ -108,4 +106,4 @@ class InterHumanReader(Reader):
 class InterHuman(Prepared):
     """InterHuman from a store that `magnet data prepare interhuman` made: scenes of two people."""
 
-    reader: ClassVar[type[Reader]] = InterHumanReader
+    reader = InterHumanReader

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal
 
-from magnet.datamodules.clip import Split
+from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import OR_YOURS, open_names, open_npz
 from magnet.datamodules.reading.fields import PersonMotion, first_folder, listing, person, side_by_side
@@ -41,18 +41,18 @@ class InterXReader(Reader):
         DataError: no motions, or the processed .h5 alone.
     """
 
-    name: ClassVar[str] = "interx"
-    title: ClassVar[str] = "Inter-X"
-    source: ClassVar[str] = "https://github.com/liangxuy/Inter-X"
-    licence: ClassVar[str] = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.interx"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "smplx"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "interx"
+    title = "Inter-X"
+    source = "https://github.com/liangxuy/Inter-X"
+    licence = "CC BY-NC-SA 4.0 and its terms for research; no redistribution"
+    fake = "magnet.datamodules.fakes.interx"
+    family = "smplx"
+    layout = (
         ("motions/CLIP/{P1,P2}.npz", "such as G001T000A000R000/P1.npz"),
         ("splits/{train,val,test}.txt", "the official lists"),
         ("annots/interaction_order.pkl", "not needed, says who acts"),
     )
-    version: ClassVar[int] = 2  # genders are read
+    version = 2  # genders are read
 
     def __init__(
         self, root: str | Path, split: Literal["official", "paper"] = "official", lists: Path | None = None
@@ -74,7 +74,7 @@ class InterXReader(Reader):
         """By a clip's number, from the lists."""
         where = self._listed_in()
         found: dict[str, Split] = {}
-        for name in get_args(Split):
+        for name in SPLITS:
             for clip in self._listed(where, name):
                 if found.setdefault(clip, name) != name:
                     raise DataError(f"{where}: clip {clip} is in both {found[clip]} and {name}; make the lists anew")
@@ -159,4 +159,4 @@ class InterXReader(Reader):
 class InterX(Prepared):
     """Pairs of Inter-X, from a store that `magnet data prepare interx` made."""
 
-    reader: ClassVar[type[Reader]] = InterXReader
+    reader = InterXReader

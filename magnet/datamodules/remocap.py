@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, open_npz, require
-from magnet.datamodules.reading.fields import first_folder, listing, mapping, person, shortest, side_by_side
+from magnet.datamodules.reading.fields import first_folder, listing, person, pickled_mapping, shortest, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.reading.remocap_track import MAP, RATE, file_like, track
 from magnet.datamodules.registry import register_data
-from magnet.unpickle import load_object_npy, load_pickle
 
 PLACES = ("", "LindyHop", "ReMoCap/LindyHop", "data/LindyHop")
 PEOPLE = ("0", "1")
@@ -47,19 +46,19 @@ class ReMoCapReader(Reader):
         DataError: no sequences.
     """
 
-    name: ClassVar[str] = "remocap"
-    title: ClassVar[str] = "ReMoCap"
-    source: ClassVar[str] = "https://github.com/anindita127/ReMoS"
-    licence: ClassVar[str] = "research only, no redistribution"
-    fake: ClassVar[str] = "magnet.datamodules.fakes.remocap"
-    family: ClassVar[Literal["smplx", "smpl", "positions"]] = "positions"
-    layout: ClassVar[tuple[tuple[str, str], ...]] = (
+    name = "remocap"
+    title = "ReMoCap"
+    source = "https://github.com/anindita127/ReMoS"
+    licence = "research only, no redistribution"
+    fake = "magnet.datamodules.fakes.remocap"
+    family = "positions"
+    layout = (
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion.bvh", "the skeleton"),
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_worldpos.csv", "positions; motion_worldpose.csv will do"),
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_rotations.csv", "not needed, proves joints and units"),
         ("ReMoCap/LindyHop/{train,test}/NUMBER/{0,1}/motion_offsets.pkl", "not needed, the same"),
     )
-    version: ClassVar[int] = 2  # notes in whole millimetres
+    version = 2  # notes in whole millimetres
 
     def __init__(
         self,
@@ -145,11 +144,7 @@ class ReMoCapReader(Reader):
 
     def _fit(self, path: Path) -> Recording:
         keys = ("body_pose", "orient", "trans", "betas")
-        held: dict[str, Any]
-        if path.suffix == ".npz":
-            held = dict(open_npz(path, keys))
-        else:
-            held = dict(mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path)))
+        held = open_npz(path, keys) if path.suffix == ".npz" else pickled_mapping(path)
         require(path, held, keys)
         people = []
         for p in range(2):
@@ -171,7 +166,7 @@ class ReMoCapReader(Reader):
 class ReMoCap(Prepared):
     """LindyHop couples of ReMoCap, from a store that `magnet data prepare remocap` made."""
 
-    reader: ClassVar[type[Reader]] = ReMoCapReader
+    reader = ReMoCapReader
 
 
 # -- files -------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 
 from magnet.datamodules.reading.arrays import Doubles, floats, one_length, one_shape, require
 from magnet.datamodules.reading.recording import GENDERS, Axis, DataError, Gender, Recording
+from magnet.unpickle import load_object_npy, load_pickle
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,15 @@ def mapping(where: object, held: Any) -> Mapping[str, Any]:
         what = f"an array {held.shape}" if isinstance(held, np.ndarray) else f"a {type(held).__name__}"
         raise DataError(f"{where}: holds {what}, expected a dict of named arrays; is it another file of the data set?")
     return held
+
+
+def pickled_mapping(path: Path) -> Mapping[str, Any]:
+    """The dict with text keys that a .pkl holds, or an .npy as its one object. No code in it is run.
+
+    Raises:
+        DataError: no such file, damaged, or it holds something else.
+    """
+    return mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path))
 
 
 def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Doubles:

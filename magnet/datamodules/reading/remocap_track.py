@@ -12,10 +12,10 @@ import numpy as np
 
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length
 from magnet.datamodules.reading.asf_amc import euler
-from magnet.datamodules.reading.fields import mapping
+from magnet.datamodules.reading.fields import pickled_mapping
 from magnet.datamodules.reading.recording import DataError
 from magnet.motion.bvh import bvh_header
-from magnet.unpickle import contents, load_pickle
+from magnet.unpickle import contents
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP,
@@ -267,7 +267,7 @@ def _offsets(folder: Path, header: BvhSkeleton) -> tuple[Doubles, str]:
     paths = sorted(folder.glob("*offsets.pkl"))
     if not paths:
         return header.offsets, "the BVH"
-    held = mapping(paths[0], load_pickle(paths[0]))
+    held = pickled_mapping(paths[0])
     offsets = header.offsets.copy()
     for k, name in enumerate(header.names):
         if name in held:
