@@ -11,8 +11,15 @@ import torch
 
 from magnet.body.joints import JOINT_NAMES, PARENTS
 from magnet.datamodules.fakes.body import write_body
-from magnet.datamodules.fakes.duobox import world_rotations
-from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
+from magnet.datamodules.fakes.motion import (
+    UP,
+    FakeMotion,
+    local_rotations,
+    people,
+    rest_joints,
+    turned,
+    world_rotations,
+)
 from magnet.datamodules.reading.recording import Axis
 from magnet.export.bvh import bvh_text, depth_first
 from magnet.motion.scene import FPS
@@ -51,9 +58,7 @@ def _file(shown: FakeMotion, person: int) -> str:
     N = UP[shown.up]  # rest poses stand in the file's world, too
     rest = CENTIMETRES * rest_joints(shown.betas, shown.kind)[person] @ N.T
     world = world_rotations(shown.poses[:, person]) @ N.T
-    local = world.copy()
-    local[:, 1:] = np.swapaxes(world[:, list(PARENTS[1:])], -1, -2) @ world[:, 1:]
-    turns = torch.from_numpy(local[:, depth_first(PARENTS)])
+    turns = torch.from_numpy(local_rotations(world, PARENTS)[:, depth_first(PARENTS)])
     degrees = roma.rotmat_to_euler("ZYX", turns, degrees=True).numpy().reshape(shown.frames, -1)
     numbers = np.concatenate([CENTIMETRES * shown.positions[:, person, 0], degrees], axis=1)
     rows = [" ".join(f"{x:.6f}" for x in row) for row in numbers.tolist()]

@@ -6,18 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import roma
-import torch
 
-from magnet.body import PARENTS as OURS
+from magnet.body.joints import HEAD, NECK, PELVIS, SPINE1, SPINE3
 from magnet.datamodules.duobox import FITS, PARENTS, RATE, SKELETONS, SKIPPED
 from magnet.datamodules.fakes.body import write_body
-from magnet.datamodules.fakes.motion import FakeMotion, people, turned
+from magnet.datamodules.fakes.motion import ARM, LEG, FakeMotion, local_rotations, people, turned, world_rotations
 from magnet.motion.scene import FPS
-
-from magnet.body.joints import (  # isort: skip
-    ANKLES, COLLARS, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE3, TOES, WRISTS,
-)  # fmt: skip
 
 NAMES = (
     "000_ma_jab_liu_defense", "001_liu_hook_ma_defense", "002_tian_jab_ma_defense", "003_liu_free_tian_free",
@@ -25,7 +19,6 @@ NAMES = (
 )  # fmt: skip
 SHARE = 5
 """A take's test part is a fifth of it."""
-LEG, ARM = (HIPS, KNEES, ANKLES, TOES), (COLLARS, SHOULDERS, ELBOWS, WRISTS)
 SOURCE = (
     PELVIS, SPINE1, SPINE3, NECK, HEAD, *(pair[0] for pair in ARM), *(pair[1] for pair in ARM),
     *(pair[0] for pair in LEG), *(pair[1] for pair in LEG),
@@ -75,25 +68,7 @@ def write_scenes(out: Path, scenes: Mapping[str, FakeMotion]) -> None:
                 "betas": np.tile(one["betas"], (shown.frames, 1)),
             }
             skeletons[f"{subject}_position"] = shown.positions[:, person, list(SOURCE)].astype(np.float32)
-            skeletons[f"{subject}_rotation"] = _local(shown.poses[:, person]).astype(np.float32)
+            world = world_rotations(shown.poses[:, person])[:, list(SOURCE)]
+            skeletons[f"{subject}_rotation"] = local_rotations(world, PARENTS).astype(np.float32)
         np.save(out / FITS / f"{name}.npy", fits, allow_pickle=True)  # type: ignore[arg-type]
         np.save(out / SKELETONS / f"{name}.npy", skeletons, allow_pickle=True)  # type: ignore[arg-type]
-
-
-def _local(poses: np.ndarray) -> np.ndarray:
-    """MOTIVE's rotations, the root's in the world, others relative to their parents. (T, 22, 3) -> (T, 21, 3, 3)"""
-    world = world_rotations(poses)[:, list(SOURCE)]
-    local = world.copy()
-    for k, parent in enumerate(PARENTS):
-        if parent >= 0:
-            local[:, k] = np.swapaxes(world[:, parent], -1, -2) @ world[:, k]
-    return local
-
-
-def world_rotations(poses: np.ndarray) -> np.ndarray:
-    """World rotations of our joints. (T, 22, 3) axis-angle -> (T, 22, 3, 3)"""
-    world = roma.rotvec_to_rotmat(torch.from_numpy(poses)).numpy()
-    for k, parent in enumerate(OURS):
-        if parent >= 0:
-            world[:, k] = world[:, parent] @ world[:, k]
-    return world

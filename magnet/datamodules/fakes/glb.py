@@ -11,8 +11,7 @@ import torch
 
 from magnet.body.joints import PARENTS
 from magnet.datamodules.fakes.body import write_body
-from magnet.datamodules.fakes.duobox import world_rotations
-from magnet.datamodules.fakes.motion import UP, Array, FakeMotion, people, rest_joints
+from magnet.datamodules.fakes.motion import UP, Array, FakeMotion, local_rotations, people, rest_joints, world_rotations
 from magnet.export.bones import bone_names
 from magnet.export.glb import FLOAT, Gltf, animation
 from magnet.motion.rotations import to_quat
@@ -54,11 +53,9 @@ def _person(gltf: Gltf, times: int, shown: FakeMotion, person: int) -> None:
     rest = rest_joints(shown.betas, shown.kind)[person] @ R_armature_rest.T / METRE
     place = shown.positions[:, person, 0] @ R_WORLD_ARMATURE / METRE
     bones = R_WORLD_ARMATURE.T @ world_rotations(shown.poses[:, person]) @ R_armature_rest.T @ OWN
-    local, resting, away = bones.copy(), OWN.copy(), rest.copy()
+    local, resting, away = local_rotations(bones, PARENTS), local_rotations(OWN[None], PARENTS)[0], rest.copy()
     for k, parent in enumerate(PARENTS):
         if parent >= 0:
-            local[:, k] = np.swapaxes(bones[:, parent], -1, -2) @ bones[:, k]
-            resting[k] = OWN[parent].T @ OWN[k]
             away[k] = OWN[parent].T @ (rest[k] - rest[parent])
     label, nodes = f"dancer{person + 1}", gltf.document["nodes"]
     armature = {"name": label, "rotation": _quat(R_WORLD_ARMATURE), "scale": [METRE] * 3}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body import Body, load_body
+from magnet.body.joints import ANKLES, COLLARS, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, TOES, WRISTS
 from magnet.datamodules.fakes.body import Kind, write_body
 from magnet.datamodules.reading.recording import Axis
 from magnet.motion.frames import rigid
@@ -23,6 +25,7 @@ from magnet.synthesis import synthesize
 from magnet.synthesis.generate import FEWEST_FRAMES
 
 Array = NDArray[np.float64]
+LEG, ARM = (HIPS, KNEES, ANKLES, TOES), (COLLARS, SHOULDERS, ELBOWS, WRISTS)
 
 UP: dict[Axis, Array] = {
     "+y": np.eye(3),
@@ -73,6 +76,24 @@ def made_up_body(kind: Kind = "smplx") -> Body:
 def rest_joints(betas: Array, kind: Kind = "smplx") -> Array:
     """Rest joints of the made-up body. (P, 10) -> (P, 22, 3) metres"""
     return made_up_body(kind).rest_joints(torch.from_numpy(betas)).numpy()
+
+
+def world_rotations(poses: Array) -> Array:
+    """World rotations of our joints. (T, 22, 3) axis-angle -> (T, 22, 3, 3)"""
+    world: Array = roma.rotvec_to_rotmat(torch.from_numpy(poses)).numpy()
+    for k, parent in enumerate(PARENTS):
+        if parent >= 0:
+            world[:, k] = world[:, parent] @ world[:, k]
+    return world
+
+
+def local_rotations(world: Array, parents: Sequence[int]) -> Array:
+    """World rotations (T, K, 3, 3) relative to each joint's parent; those of a root stay."""
+    local = world.copy()
+    for k, parent in enumerate(parents):
+        if parent >= 0:
+            local[:, k] = np.swapaxes(world[:, parent], -1, -2) @ world[:, k]
+    return local
 
 
 def people(frames: int, persons: int, fps: float = FPS, seed: int = 0, kind: Kind = "smplx") -> FakeMotion:

@@ -15,21 +15,16 @@ import numpy as np
 import roma
 import torch
 
+from magnet.body.joints import HEAD, NECK, PELVIS, SPINE1, SPINE2, SPINE3
 from magnet.datamodules.fakes.body import write_body
-from magnet.datamodules.fakes.duobox import world_rotations
-from magnet.datamodules.fakes.motion import FakeMotion, people, rest_joints
+from magnet.datamodules.fakes.motion import ARM, LEG, FakeMotion, people, rest_joints, world_rotations
 from magnet.datamodules.reading.remocap_track import RATE
 from magnet.export.bvh import bvh_text
 from magnet.motion.scene import FPS
 
-from magnet.body.joints import (  # isort: skip
-    ANKLES, COLLARS, ELBOWS, HEAD, HIPS, KNEES, NECK, PELVIS, SHOULDERS, SPINE1, SPINE2, SPINE3, TOES, WRISTS,
-)  # fmt: skip
-
 SEQUENCES = (3, 8, 6, 5, 7, 9, 10, 16)
 TESTED = (6,)
 MILLIMETRES = 1000.0
-LEG, ARM = (HIPS, KNEES, ANKLES, TOES), (COLLARS, SHOULDERS, ELBOWS, WRISTS)
 CHANNELS = "ZXY"
 """Rotations in the order of the BVH; the csv lists X, Y and Z all the same."""
 
