@@ -265,11 +265,9 @@ def make(store: Path, frames: int, clip_frames: int = 300, persons: int = 2) -> 
     class Walk(PackSource):
         number: int = 0
 
-        def head(self, old: Any) -> ConvertedTake:
-            return replace(self.whole(old), rows=parts[0].rows[:0])
-
-        def whole(self, old: Any) -> ConvertedTake:
-            return replace(parts[self.number % len(parts)], names=(self.take.name,))
+        def load(self, old: Any, rows: bool = True) -> ConvertedTake:
+            part = replace(parts[self.number % len(parts)], names=(self.take.name,))
+            return part if rows else part.without_rows()
 
     begin = time.perf_counter()
     takes = [Take(f"walk{i:06d}", (), "train") for i in range(-(-frames // (clip_frames * persons)))]

@@ -285,11 +285,15 @@ class MotionDataModule(LightningDataModule):
         plain = windows = fixed_windows(store, frames, self.test.stride or frames)
         if self.test.limit is not None and len(plain) > self.test.limit:
             kept = np.arange(self.test.limit) * len(plain) // self.test.limit
-            windows = WindowIndex.concatenate([plain[slice(k, k + 1)] for k in kept])
-        if self.test.composed and len(plain):
-            composed = composed_windows(store, plain, self.test.composed, self.augment.compose_apart, self.seed)
-            windows = WindowIndex.concatenate([windows, composed])
-        return windows
+            windows = plain[kept]
+        return self._with_composed(store, windows, plain, self.test.composed)
+
+    def _with_composed(self, store: MemoryStore, windows: WindowIndex, plain: WindowIndex, count: int) -> WindowIndex:
+        """The windows, and behind them so many scenes that are made of two plain ones each."""
+        if not count or not len(plain):
+            return windows
+        composed = composed_windows(store, plain, count, self.augment.compose_apart, self.seed)
+        return WindowIndex.concatenate([windows, composed])
 
     def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
         """Valid training windows of `frames` frames, `stride` apart, and `composed` scenes made of two of them each.
@@ -314,11 +318,7 @@ class MotionDataModule(LightningDataModule):
     def _train_index(self, frames: int, stride: int, composed: int) -> WindowIndex:
         store = self.store("train")
         windows = self._some("train", fixed_windows(store, frames, stride), frames)
-        if composed:
-            windows = WindowIndex.concatenate(
-                [windows, composed_windows(store, windows, composed, self.augment.compose_apart, self.seed)]
-            )
-        return windows
+        return self._with_composed(store, windows, windows, composed)
 
     # -- Lightning -----------------------------------------------------------------------------
 

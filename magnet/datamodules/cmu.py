@@ -90,10 +90,8 @@ class CMUReader(Reader):
         if not self.root.is_dir():
             raise DataError(f"{self.root}: no such folder. {WHERE}")
         self.singles = singles
-        held: tuple[tuple[Split, Sequence[int], Sequence[str]], ...]
-        held = (("test", test_takes, test_singles), ("val", val_takes, val_singles))
-        self.couples_in: dict[int, Split] = {number: split for split, numbers, _ in held for number in numbers}
-        self.singles_in: dict[str, Split] = {name: split for split, _, names in held for name in names}
+        self.couples_in: dict[int, Split] = {**dict.fromkeys(test_takes, "test"), **dict.fromkeys(val_takes, "val")}
+        self.singles_in: dict[str, Split] = {**dict.fromkeys(test_singles, "test"), **dict.fromkeys(val_singles, "val")}
         self.trim = trim
         self.fps: dict[int, float] = dict(RATES)
         for subject, rate in (fps or {}).items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from magnet.datamodules.clip import Clip, Split
 from magnet.datamodules.preparing import check_motion, check_people
 from magnet.datamodules.preparing.check_people import Flag
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.export.rig import UP
 from magnet.export.smpl_keys import SMPLX_PELVIS
 from magnet.motion.frames import rigid
 from magnet.motion.resample import resample_points, resample_rotations, resample_valid
@@ -32,14 +33,7 @@ CANONICALIZE_VERSION = 5
 FLOOR_PERCENTILE = 5.0
 """Of everybody's lowest soles over a whole take: people stand nearly always, and few soles are tracked too low."""
 
-R_WORLD_FILE: dict[Axis, Tensor] = {
-    "+y": torch.eye(3, dtype=torch.float64),
-    "-y": torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)),
-    "+z": torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64),
-    "-z": torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64),
-    "+x": torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64),
-    "-x": torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64),
-}
+R_WORLD_FILE: dict[Axis, Tensor] = {axis: torch.from_numpy(UP[axis.removeprefix("+")]) for axis in get_args(Axis)}
 """Rotation that takes a file's up axis to +y."""
 
 

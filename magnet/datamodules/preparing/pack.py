@@ -28,15 +28,8 @@ class PackSource:
     file: Path
     place: dict[str, Any] | None  # in the present store
 
-    def head(self, old: StoreReader | None) -> ConvertedTake:
-        """All but the rows."""
-        return self._load(old, rows=False)
-
-    def whole(self, old: StoreReader | None) -> ConvertedTake:
-        """With its rows."""
-        return self._load(old, rows=True)
-
-    def _load(self, old: StoreReader | None, rows: bool) -> ConvertedTake:
+    def load(self, old: StoreReader | None, rows: bool = True) -> ConvertedTake:
+        """The take, with or without its rows, which are most of it. old: the present store"""
         if self.place is None or old is None:
             return ConvertedTake.load(self.file, rows)
         split, first, count = self.place["split"], self.place["first"], self.place["clips"]
@@ -63,15 +56,15 @@ def pack(
 
     Returns where each take's clips are, by its name; None when no take gave any, and nothing was written.
     """
-    heads = [source.head(old) for source in sources]
-    if not any(head.names for head in heads):
+    pairs = [(source, source.load(old, rows=False)) for source in sources]
+    if not any(head.names for _, head in pairs):
         return None
     table: dict[str, list[Any]] = {"name": [], "take": [], "split": [], "frames": [], "people": [], "persons": []}
     places: dict[str, dict[str, Any]] = {}
     betas: list[NDArray[np.float32]] = []
     shown: dict[str, Any] = {}
     for split in SPLITS:
-        mine = [(s, h) for s, h in zip(sources, heads, strict=True) if s.take.split == split and h.error is None]
+        mine = [(source, head) for source, head in pairs if source.take.split == split and head.error is None]
         first = 0
         for source, head in mine:
             count = len(head.names)
@@ -90,9 +83,9 @@ def pack(
         ]
         frames, people = ([n for _, head in mine for n in getattr(head, key)] for key in ("frames", "people"))
         shown[split] = split_counts(len(mine), frames, people) | {"shards": shards}
-    failed = {s.take.name: (s.take.split, h.error) for s, h in zip(sources, heads, strict=True) if h.error is not None}
-    notes = [(note, s.take.name) for s, h in zip(sources, heads, strict=True) for note in h.notes]
-    persons = [(h.persons, s.take.name) for s, h in zip(sources, heads, strict=True) if h.error is None]
+    failed = [(source.take, head.error) for source, head in pairs if head.error is not None]
+    notes = [(note, source.take.name) for source, head in pairs for note in head.notes]
+    persons = [(head.persons, source.take.name) for source, head in pairs if head.error is None]
     shapes = np.concatenate(betas).astype("<f4")
     manifest = {
         **facts,
@@ -101,7 +94,7 @@ def pack(
         "clips": _written(out, "clips", "json", as_json(table)),
         "betas": _written(out, "betas", "npy", lambda file: np.lib.format.write_array(file, shapes, version=(1, 0))),
         "splits": shown,
-        "skipped": [{"take": name, "split": split, "why": why} for name, (split, why) in failed.items()],
+        "skipped": [{"take": take.name, "split": take.split, "why": why} for take, why in failed],
         "notes": [{"note": note, "takes": takes} for note, takes in by_first(notes)],
         "persons": [{"persons": names, "takes": takes} for names, takes in by_first(persons) if names],
     }
@@ -144,7 +137,7 @@ def write_shard(
             file, {"descr": np.lib.format.dtype_to_descr(ROW), "fortran_order": False, "shape": (rows,)}
         )
         for source in sources:
-            file.write(np.ascontiguousarray(source.whole(old).rows).tobytes())
+            file.write(np.ascontiguousarray(source.load(old).rows).tobytes())
 
     return {**_written(out, f"{split}-{number:05d}", "npy", write), "rows": rows}
 

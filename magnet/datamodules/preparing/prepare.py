@@ -100,7 +100,7 @@ def prepare(
             facts["limit"] = limit
         packed = pack(sources, old, out, facts, shard_rows)
         if packed is None:
-            listed = "".join(f"\n  {s.take.name}: {s.head(None).error}" for s in sources[:20])
+            listed = "".join(f"\n  {s.take.name}: {s.load(None, rows=False).error}" for s in sources[:20])
             none = f"{reader.title}: none of {len(takes)} takes could be used"
             raise DataError(f"{none}; check --root and these files:{listed}")
         folder = StoreReader(out)
@@ -286,12 +286,9 @@ def remembered(state: Path, old: StoreReader | None) -> dict[str, Any]:
         return {}
     if found.get("manifest") != file_hash(old.path / MANIFEST):
         return {}
-    damaged = [
-        name
-        for name, digest in old.files().items()
-        if not (old.path / name).is_file() or file_hash(old.path / name) != digest
-    ]
-    return {} if damaged else found["takes"]
+    files = {old.path / name: digest for name, digest in old.files().items()}
+    whole = all(path.is_file() and file_hash(path) == digest for path, digest in files.items())
+    return found["takes"] if whole else {}
 
 
 OURS = re.compile(r"((train|val|test)-\d{5}|clips|betas)-[0-9a-f]{8}\.(npy|json)|\.new-.*")

@@ -16,7 +16,7 @@ from importlib import resources
 from pathlib import Path
 
 from magnet.datamodules.reading.cmu_subjects import folder_of
-from magnet.files import file_hash
+from magnet.files import file_hash, write_whole
 
 SITE = "http://mocap.cs.cmu.edu"  # plain: the site's certificate chain is incomplete
 MOST_SUBJECTS = 20
@@ -115,19 +115,20 @@ def download_cmu(
                 part = _fetch(f"{base_url}/subjects/{subject}/{file}", target, retries, progress)
                 time.sleep(retries.pause)
             found = file_hash(target if there else part)
-            if known not in (None, found) and not any_version:
+            strange = known not in (None, found)
+            if strange and not any_version:
                 refused.append(f"{target}: its SHA-256 is {found}, expected {known}")
                 if not there:
                     part.unlink()
                 continue
-            if known not in (None, found):
+            if strange:
                 unlike.append(name)
             if not there:
                 os.replace(part, target)
             (kept if there else fetched).append(name)
             if manifest.get(name) != found:
                 manifest[name] = found
-                _write_manifest(folder / MANIFEST, manifest)
+                _write_manifest(folder, manifest)
     if refused:
         raise DownloadError(_refusal(refused))
     return Downloaded(folder, tuple(fetched), tuple(kept), tuple(unlike))
@@ -333,10 +334,8 @@ def _hashes(text: str) -> dict[str, str]:
     return {name: found for found, name in re.findall(r"^([0-9a-f]{64})  (.+)$", text, flags=re.MULTILINE)}
 
 
-def _write_manifest(path: Path, manifest: dict[str, str]) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_text("".join(f"{found}  {name}\n" for name, found in sorted(manifest.items())), encoding="utf-8")
-    os.replace(beside, path)
+def _write_manifest(folder: Path, manifest: dict[str, str]) -> None:
+    write_whole(folder, MANIFEST, "".join(f"{found}  {name}\n" for name, found in sorted(manifest.items())).encode())
 
 
 def known_hashes() -> dict[str, str]:

@@ -66,17 +66,17 @@ def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Double
     return floats(f"{where}: {key}", value, ("T", width))
 
 
-def shape_numbers(where: object, held: Mapping[str, Any], key: str = "betas") -> tuple[Doubles, tuple[str, ...]]:
-    """A person's first ten shape numbers from (10+,), (1, 10+) or (T, 10+). -> (10,), notes
+def shape_numbers(where: object, held: Mapping[str, Any]) -> tuple[Doubles, tuple[str, ...]]:
+    """A person's first ten shape numbers from `betas` (10+,), (1, 10+) or (T, 10+). -> (10,), notes
 
     Raises:
         DataError: no such key, another shape, or NaN.
     """
-    require(where, held, (key,))
-    value = held[key]
+    require(where, held, ("betas",))
+    value = held["betas"]
     if isinstance(value, np.ndarray) and value.ndim == 1:
         value = value[None]
-    return one_shape(f"{where}: {key}", floats(f"{where}: {key}", value, ("T", "shapes")))
+    return one_shape(f"{where}: betas", floats(f"{where}: betas", value, ("T", "shapes")))
 
 
 def gender_of(said: Any) -> Gender | None:

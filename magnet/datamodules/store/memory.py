@@ -37,7 +37,7 @@ class WindowIndex:
     def __len__(self) -> int:
         return len(self.clips)
 
-    def __getitem__(self, part: slice) -> WindowIndex:
+    def __getitem__(self, part: slice | Ints) -> WindowIndex:
         return WindowIndex(*(getattr(self, f)[part] for f in self.__dataclass_fields__))
 
     @staticmethod
