@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 from magnet.errors import Stopped
 
@@ -135,6 +137,19 @@ class Registry:
             many = len(found) > 1
             why = "; ".join(told(each.error) + (f" (of {each.origin})" if many else "") for each in found)
             raise ValueError(f"{self.what} {found[0].name} failed to load: {why}") from found[0].error
+
+
+def subclasses(base: type) -> list[type]:
+    """A class and all that are made of it, each once and behind those that it is made of."""
+    found: list[Any] = [base]
+    for kind in found:
+        found += [each for each in kind.__subclasses__() if each not in found]
+    return found
+
+
+def summary(kind: type) -> str:
+    """The first paragraph of what a class says of itself, in one line."""
+    return (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
 
 
 def attempted(call: Callable[[], object]) -> BaseException | None:

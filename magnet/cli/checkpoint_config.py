@@ -19,9 +19,10 @@ from magnet import checkpoints
 from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
-from magnet.cli.kept_checkpoints import no_run
+from magnet.cli.flags import taken_out
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.old_names import renamed_flags, told
+from magnet.plugins import subclasses
 
 Spec = dict[str, Any]
 """A class and its options: {"class_path": ..., "init_args": {...}}."""
@@ -112,36 +113,7 @@ class Arguments:
 
     def without(self, key: str) -> list[str]:
         """The flags, less one and its value."""
-        kept: list[str] = []
-        rest = iter(self.flags)
-        for argument in rest:
-            if argument == f"--{key}":
-                next(rest, None)
-            elif not argument.startswith(f"--{key}="):
-                kept.append(argument)
-        return kept
-
-
-def find_checkpoint(
-    name: str | None, folders: Iterable[Path], runs: Path | None = None, option: str = "--ckpt_path"
-) -> Path:
-    """What an option means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
-
-    Raises:
-        CommandError: there is none; says which there are in `runs`.
-    """
-    if name in ("last", "best"):
-        folders = list(folders)
-        found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]
-        if not found:
-            raise CommandError(no_run(name, folders, runs, option))
-        return max(found, key=lambda file: file.stat().st_mtime)
-    try:
-        return checkpoints.resolve(name)
-    except ValueError as error:
-        if name is None:
-            raise CommandError("no weights come with this version: train a model, then give --ckpt_path") from error
-        raise CommandError(str(error)) from error
+        return taken_out(self.flags, rf"--{key}(=|$)")[1]
 
 
 @dataclass(frozen=True)
@@ -208,11 +180,7 @@ def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, kee
         for linked in LINKS.values():
             model_args.pop(linked, None)
     elif model_args:
-        linked_values = {"max_agents": model_args.get("max_agents")}
-        if model_args.get("window") is not None:
-            linked_values["window_frames"] = TOKEN_FRAMES * model_args["window"]
-        accepted = options_of(class_named(layer["data"]["class_path"]))
-        layer["data"]["init_args"] |= {k: v for k, v in linked_values.items() if v is not None and k in accepted}
+        layer["data"]["init_args"] |= agreeing(layer["data"]["class_path"], model_args)
     return layer
 
 
@@ -259,10 +227,7 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
     layer = {"model": {"class_path": path, "init_args": {k: v for k, v in kept.items() if k not in LINKS.values()}}}
     if short == "Denoiser":
         data = given.class_of("data") or data_default
-        linked = {"max_agents": kept.get("max_agents"), "window_frames": TOKEN_FRAMES * kept.get("window", 0) or None}
-        accepted = options_of(class_named(data))
-        wanted = {key: value for key, value in linked.items() if value is not None and key in accepted}
-        layer["data"] = {"class_path": data, "init_args": wanted}
+        layer["data"] = {"class_path": data, "init_args": agreeing(data, kept)}
     return layer
 
 
@@ -281,6 +246,14 @@ def _ours(named: str, models: dict[str, str]) -> str | None:
 
 LINKS = {"max_agents": "max_agents", "window_frames": "window"}
 """Options of the data that the model must agree with, and what they are called there."""
+
+
+def agreeing(data: str, model: dict[str, Any]) -> dict[str, Any]:
+    """Options of a data set's class that go with those of a model: as many people and frames, where it has them."""
+    window = model.get("window")
+    linked = {"max_agents": model.get("max_agents"), "window_frames": None if window is None else TOKEN_FRAMES * window}
+    accepted = options_of(class_named(data))
+    return {key: value for key, value in linked.items() if value is not None and key in accepted}
 
 
 def tokens(window_frames: int) -> int:
@@ -312,10 +285,7 @@ def class_named(path: str) -> type | None:
         return getattr(importlib.import_module(module), name, None)
     from lightning.pytorch import LightningDataModule
 
-    found: list[type] = [LightningDataModule]
-    for kind in found:
-        found.extend(kind.__subclasses__())
-    return next((kind for kind in found if kind.__name__ == path), None)
+    return next((kind for kind in subclasses(LightningDataModule) if kind.__name__ == path), None)
 
 
 def options_of(kind: type | None) -> set[str]:

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
-from magnet.cli.flags import PlainParser
-from magnet.cli.predict_files import flat
+from magnet.cli.flags import PlainParser, flat
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from magnet import plugins
+from magnet.cli import answers
 from magnet.cli.flags import PlainParser
 from magnet.version import __version__
 
@@ -64,7 +65,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns 0, or 1 where something is wrong; what is only missing is no fault."""
     parser = PlainParser("doctor", __doc__)
     parser.parse_args(list(arguments))
-    found = [*packages(), *devices(), *extras(), *blender(), *others(), *files()]
+    parts = (packages, extras) if version_of("torch") is None else (packages, devices, extras, blender, others, files)
+    found = [finding for part in parts for finding in part()]
     wide = max(len(finding.what) for finding in found)
     print(f"magnet {__version__} in {Path(__file__).parents[1]}")
     room = ""
@@ -107,8 +109,6 @@ def packages() -> Iterator[Finding]:
 
 def devices() -> Iterator[Finding]:
     """Where models can run."""
-    if version_of("torch") is None:
-        return
     import torch
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -145,8 +145,6 @@ def extras() -> Iterator[Finding]:
 
 def blender() -> Iterator[Finding]:
     """What writes .fbx."""
-    if version_of("torch") is None:
-        return
     from magnet.export.fbx import VARIABLE
     from magnet.export.fbx import blender as command
 
@@ -170,8 +168,6 @@ GROUPS = ("magnet.tasks", "magnet.datamodules", "magnet.metrics")
 
 def others() -> Iterator[Finding]:
     """What other packages add; nothing is imported where none adds anything."""
-    if version_of("torch") is None:
-        return
     if not os.environ.get("MAGNET_TASKS") and not any(plugins.entry_points(group=group) for group in GROUPS):
         return
     from magnet.datamodules import registry as data
@@ -203,8 +199,6 @@ def _other(what: str, origin: str, fault: str | None) -> Finding:
 
 def files() -> Iterator[Finding]:
     """Models and data, and what may be written."""
-    if version_of("torch") is None:
-        return
     from magnet import checkpoints
 
     for name in checkpoints.names():
@@ -217,7 +211,7 @@ def files() -> Iterator[Finding]:
         else:
             yield Finding("files", f"model {name}", "ok", f"{folder}, {size:.0f} MB, every hash right")
     yield _recordings()
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
+    cache = answers.folder()
     kept = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) / 1e6 if cache.is_dir() else 0.0
     yield Finding("files", "cache", "ok", f"{cache}, {kept:.0f} MB; it may be deleted")
     yield _runs(Path("runs"))

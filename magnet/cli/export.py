@@ -158,7 +158,7 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
     Raises:
         CommandError: names the option and what it is for.
     """
-    from magnet.export.formats import FILM, PICTURES, USD
+    from magnet.export.formats import PICTURES, USD
 
     shown = (".html", ".png", *PICTURES)
     bones = (".glb", ".fbx", *USD)
@@ -177,11 +177,10 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
         ("clips", "scene", (".glb",)),
         ("rig", [], (".glb", ".fbx", ".bvh")),
         ("context", 0, shown),
-        ("style", "body", shown),
-        ("size", FILM, PICTURES),
         ("title", None, shown),
     ):
         scene_files.refuse_unused(options, flag, plain, takes, [suffix])
+    scene_files.refuse_unused_look(options, [suffix])
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:

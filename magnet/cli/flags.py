@@ -51,6 +51,14 @@ def spec_of(value: Any) -> Options:
     return value if isinstance(value, dict) else {}
 
 
+def flat(options: Options, within: str = "") -> Options:
+    """Options of groups as flags name them, `group.option`."""
+    found: Options = {}
+    for key, value in options.items():
+        found |= flat(value, f"{within}{key}.") if isinstance(value, dict) else {f"{within}{key}": value}
+    return found
+
+
 def class_in_flags(flags: Sequence[str], key: str) -> str | None:
     """The class that the last flag to name one names under a key; by a mapping or in a file, too."""
     named = [value for name, value in valued(flags) if name in (f"--{key}", f"--{key}.class_path")]

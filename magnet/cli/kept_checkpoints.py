@@ -1,4 +1,4 @@
-"""Which checkpoints there are, for messages that say which one to name."""
+"""Checkpoints by name: which one an option means, and which there are, for messages that say which to name."""
 
 from __future__ import annotations
 
@@ -6,8 +6,44 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from magnet import checkpoints
+from magnet.cli.errors import CommandError
+
+RUNS = Path("runs")
+"""Where runs lie unless something else is said."""
 NAMED = 3
 """So many are named at most."""
+
+
+def checkpoint_of(name: str | None, option: str = "--ckpt_path") -> Path:
+    """The checkpoint that an option names; where it is `last` or `best` of the runs here, a line says which that is.
+
+    Raises:
+        CommandError: there is none; says which there are.
+    """
+    return told(name, find_checkpoint(name, [RUNS], option=option), option)
+
+
+def find_checkpoint(
+    name: str | None, folders: Iterable[Path], runs: Path | None = None, option: str = "--ckpt_path"
+) -> Path:
+    """What an option means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
+
+    Raises:
+        CommandError: there is none; says which there are in `runs`.
+    """
+    if name in ("last", "best"):
+        folders = list(folders)
+        found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]
+        if not found:
+            raise CommandError(no_run(name, folders, runs, option))
+        return max(found, key=lambda file: file.stat().st_mtime)
+    try:
+        return checkpoints.resolve(name)
+    except ValueError as error:
+        if name is None:
+            raise CommandError("no weights come with this version: train a model, then give --ckpt_path") from error
+        raise CommandError(str(error)) from error
 
 
 def written(path: Path) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from magnet.cli.nested import no_class
+from magnet.plugins import subclasses
 
 OURS = {
     "NarrowCodes": "magnet.callbacks.NarrowCodes",
@@ -53,9 +54,7 @@ def by_name(base: str) -> Iterator[str]:
     """Short names of classes of Lightning and torch that are taken where one of a base is, a dotted path."""
     module, _, name = base.rpartition(".")
     base_class: Any = getattr(sys.modules.get(module), name, None)
-    found: list[Any] = [base_class] if isinstance(base_class, type) else []
-    for kind in found:
-        found += [each for each in kind.__subclasses__() if each not in found]
+    for kind in subclasses(base_class) if isinstance(base_class, type) else ():
         path = f"{kind.__module__}.{kind.__qualname__}"
         ours = kind.__module__.partition(".")[0] == "magnet"
         if path != base and not ours and "._" not in path and not inspect.isabstract(kind):

@@ -12,6 +12,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from torch.optim import Optimizer
 
 from magnet.cli.errors import CommandError, weights_alone
+from magnet.cli.parser import option
 
 KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
 """Options, and what a model does without them (`magnet.training.optim`)."""
@@ -25,15 +26,11 @@ def add_optimizer_arguments(parser: LightningArgumentParser) -> None:
     """Any optimizer and scheduler of torch by its name, or a class of somebody's by its path."""
     parser.add_optimizer_args()
     parser.add_lr_scheduler_args()
-    for group in parser._action_groups:
-        for action in group._group_actions:
-            for key, own in KEYS.items():
-                if action.option_strings == [f"--{key}"]:
-                    group.title, group.description = f"--{key} NAME", None
-                    action.metavar = "NAME"
-                    action.help = (
-                        f"a class of torch, its fields as --{key}.FIELD VALUE; default: the model's own, {own}"
-                    )
+    for key, own in KEYS.items():
+        group, action = option(parser, key)
+        group.title, group.description = f"--{key} NAME", None
+        action.metavar = "NAME"
+        action.help = f"a class of torch, its fields as --{key}.FIELD VALUE; default: the model's own, {own}"
 
 
 def choose_optimizer(model: LightningModule, config: Namespace) -> None:

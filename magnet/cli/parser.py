@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import inspect
 import re
 import sys
 import types
@@ -21,6 +20,7 @@ from magnet.cli.flags import chosen_flags, closest, refused
 from magnet.cli.misnamed import no_such_class
 from magnet.cli.named_files import unquoted
 from magnet.cli.nested import as_key, flat_key, in_files, no_class, place_of, with_place
+from magnet.plugins import summary
 
 USAGE = (
     "magnet {command} [--config FILE] [--model NAME] [--model.FIELD VALUE] [--data NAME] [--data.FIELD VALUE] "
@@ -48,6 +48,12 @@ GROUP = "Path to a configuration file."
 
 REFUSED = r"(?:(?:Option|Key) |does not accept option )'([^']+)'(?: is not (?:accepted|expected)|$|\W)"
 NOISE = ("Does not validate", "Subtypes:", "Errors:", "Given value type:", "- Expected a <class 'NoneType'>")
+
+
+def option(parser: argparse.ArgumentParser, key: str) -> tuple[Any, argparse.Action]:
+    """An option that a parser has, `--key`, and before it the group of options that it stands in."""
+    groups = [(group, action) for group in parser._action_groups for action in group._group_actions]
+    return next((group, action) for group, action in groups if f"--{key}" in action.option_strings)
 
 
 class Parser(LightningArgumentParser):
@@ -127,8 +133,7 @@ class Parser(LightningArgumentParser):
         shared: set[str] = set()
         for name, kind in self.classes[key].items():
             if key in SHARING and parts and not whole:
-                first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
-                parts.append(f"--{key} {name}: {first}")
+                parts.append(f"--{key} {name}: {summary(kind)}")
             else:
                 parts.append(_fields_help(key, name, kind, shared if key in SHARING else set()))
         if key in SHARING and not whole:
@@ -137,30 +142,21 @@ class Parser(LightningArgumentParser):
 
     def _name_choices(self, key: str) -> None:
         """Give a group a heading with the names to choose from, instead of class paths and the base class's text."""
-        names = ", ".join(self.classes[key])
-        for group in self._action_groups:
-            for action in group._group_actions:
-                if f"--{key}.help" in action.option_strings:
-                    action.help = argparse.SUPPRESS
-                if f"--{key}" in action.option_strings:
-                    action.help = argparse.SUPPRESS
-                    path = (action.default.get("class_path") or action.default["name"]) if action.default else ""
-                    default = f"; default: {path.rpartition('.')[2]}" if path else ""
-                    group.title = f"--{key} NAME"
-                    group.description = f"One of {names}{default}. Fields are --{key}.FIELD VALUE."
+        group, action = option(self, key)
+        path = (action.default.get("class_path") or action.default["name"]) if action.default else ""
+        default = f"; default: {path.rpartition('.')[2]}" if path else ""
+        group.title, action.help = f"--{key} NAME", argparse.SUPPRESS
+        group.description = f"One of {', '.join(self.classes[key])}{default}. Fields are --{key}.FIELD VALUE."
 
     def _explain_checkpoint(self) -> None:
-        for group in self._action_groups:
-            for action in group._group_actions:
-                if action.option_strings == ["--ckpt_path"]:
-                    group.title, group.description = "the weights", None
-                    action.metavar, action.help = "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"])
+        group, _ = option(self, "ckpt_path")
+        group.title, group.description = "the weights", None
+        self.explain("ckpt_path", "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"]))
 
     def explain(self, key: str, value: str, text: str) -> None:
         """Set the help of an option that Lightning or the parser has made."""
-        for action in self._actions:
-            if action.option_strings == [f"--{key}"]:
-                action.metavar, action.help = value, text
+        _, action = option(self, key)
+        action.metavar, action.help = value, text
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Say what is wrong, and the closest thing that would be right."""
@@ -315,8 +311,7 @@ def _fields_help(key: str, name: str, kind: type, shared: set[str]) -> str:
             action.help = argparse.SUPPRESS
     more = " (more fields as above)" if told & shared else "" if told else " (no fields)"
     shared |= told
-    first = (inspect.getdoc(kind) or "").split("\n\n")[0].replace("\n", " ")
     text = parser.format_help()
     lines = text.splitlines()
     start = next((i for i, line in enumerate(lines) if line.lstrip().startswith("--")), len(lines))
-    return f"--{key} {name}: {first}{more}\n" + "\n".join(lines[start:]) + "\n"
+    return f"--{key} {name}: {summary(kind)}{more}\n" + "\n".join(lines[start:]) + "\n"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli import predict_keys, predict_written, scene_files
 from magnet.cli.errors import CommandError
-from magnet.cli.flags import taken_out
+from magnet.cli.flags import flat, taken_out
 from magnet.cli.named_files import READ, require_there, require_whole
 from magnet.cli.predict_lengths import CONTEXT, FUTURE, lengths
 from magnet.sampling.presets import PRESETS
@@ -137,10 +137,9 @@ def main(arguments: Sequence[str]) -> int:
     require_counts(options)
     size, one = tuple(options.size), options.samples == 1
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
-    refuse_unused(options, [out.suffix.lower() for out in outs])
+    scene_files.refuse_unused_look(options, [out.suffix.lower() for out in outs])
     from magnet.api import Model, Motion
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.cli.kept_checkpoints import told
+    from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
@@ -154,8 +153,7 @@ def main(arguments: Sequence[str]) -> int:
         scene_files.require_unread(out, options.inputs, people)
     if options.task not in (None, "generation"):  # of a crowd these are said later: it may change the task
         task_of(options, groups["task"], ())
-    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
-    model = Model(DenoiserCore.load(found), sampler)
+    model = Model(DenoiserCore.load(checkpoint_of(options.ckpt_path)), sampler)
     scene, added = people_of(options, recorded, model)
     task = task_of(options, groups["task"], added)
     files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)
@@ -184,18 +182,6 @@ def main(arguments: Sequence[str]) -> int:
     for out in outs:
         scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
     return 0
-
-
-def refuse_unused(options: argparse.Namespace, suffixes: Sequence[str]) -> None:
-    """Refuse a look where no film, picture or page is written.
-
-    Raises:
-        CommandError: names the option and what it is for.
-    """
-    from magnet.export.formats import FILM, PICTURES
-
-    scene_files.refuse_unused(options, "style", "body", (".html", ".png", *PICTURES), suffixes)
-    scene_files.refuse_unused(options, "size", FILM, PICTURES, suffixes)
 
 
 def require_counts(options: argparse.Namespace) -> None:
@@ -337,11 +323,3 @@ def sampler_of(preset: str, flags: list[str]) -> SamplerOptions:
     known.set_defaults(flat({"sampler": sampler_preset(preset)}))
     fields = read_fields(known, flags, (), "magnet predict --help sampler")["sampler"]
     return SamplerOptions(**{**fields, "guidance": Guidance(**fields["guidance"])})
-
-
-def flat(options: dict[str, Any], within: str = "") -> dict[str, Any]:
-    """Options of groups as `group.option`."""
-    found: dict[str, Any] = {}
-    for key, value in options.items():
-        found |= flat(value, f"{within}{key}.") if isinstance(value, dict) else {f"{within}{key}": value}
-    return found

@@ -48,12 +48,11 @@ def main(arguments: Sequence[str] = ()) -> int:
 
     require_place(folder / "config.json")
     from magnet import checkpoints
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.cli.kept_checkpoints import told
+    from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.cli.release_decoder import decoder_kept, require_kind, with_decoder
     from magnet.cli.release_record import about, card, summary, without_folders
 
-    path = told(given.checkpoint, find_checkpoint(given.checkpoint, [Path("runs")]))
+    path = checkpoint_of(given.checkpoint)
     if (path / "config.json").is_file():
         raise CommandError(f"{path} is a released model already: pass on its folder as it is")
     checkpoint = checkpoints.read(path)

@@ -15,13 +15,12 @@ from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import valued
-from magnet.cli.kept_checkpoints import told
+from magnet.cli.kept_checkpoints import RUNS, find_checkpoint, told
 from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
 from magnet.datamodules import registry
 
 DEFAULT_TASK = "joint_future"
 SAMPLING = ("test", "predict")
-RUNS = Path("runs")
 SAMPLED = ("samples", "sampler", "baselines", "baseline_stride", "interval", "seed")
 """Options that say how tasks are sampled and measured."""
 FILES = {".bvh", ".ckpt", ".csv", ".gif", ".glb", ".html", ".json", ".mp4", ".npz", ".webp"}
@@ -161,9 +160,9 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         return None
     if command == "fit":  # a run goes on from where it ended, not from where it was best
         found = checkpoints.of_run(Path(name), ("last", "best"))
-        return checkpoint_config.find_checkpoint(str(found), [Path(out) if out else runs / run], runs)
+        return find_checkpoint(str(found), [Path(out) if out else runs / run], runs)
     folders = [Path(out or runs), runs / run, runs]
-    found = checkpoint_config.find_checkpoint(name, folders, runs)
+    found = find_checkpoint(name, folders, runs)
     return told(name, found) if run_folder.first_process() else found
 
 

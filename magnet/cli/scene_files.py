@@ -26,6 +26,32 @@ OF_FILES = (
     *("--body", "--in_fps", "--in_unit", "--up", "--keep_floor", "--joint", "--clip"),
 )
 """Options of `magnet predict` that go with files, or with people from nothing, and not with a data set."""
+RECORDED = (".npz", ".bvh")
+"""Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
+again."""
+IN_FPS: dict[str, Any] = {
+    "type": float,
+    "metavar": "FPS",
+    "help": "frames a second of .npz, .csv without it",
+}
+"""An option of commands that read files."""
+START: dict[str, Any] = {
+    "type": int,
+    "default": 0,
+    "metavar": "FRAME",
+    "help": "first frame of the files that is read, from 0",
+}
+END: dict[str, Any] = {
+    "type": int,
+    "metavar": "FRAME",
+    "help": "frame of the files before which reading ends (default: all)",
+}
+"""Options that choose a part of what commands read, counted at the file's own rate."""
+PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
+"""An option that names a person, and may be repeated."""
+MOMENTS, SAME_PLACE = 30, 0.02
+"""Frames that are looked at, and metres between pelvises in all of them that no two bodies leave each other."""
+OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> PlainParser:
@@ -113,34 +139,6 @@ def add_look(options: Options) -> None:
     options.add_argument("--style", choices=styles, default="body", help="of people; light: a body of few triangles")
     size = "pixels of a film's panel (640 480)"
     options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
-
-
-RECORDED = (".npz", ".bvh")
-"""Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
-again."""
-IN_FPS: dict[str, Any] = {
-    "type": float,
-    "metavar": "FPS",
-    "help": "frames a second of .npz, .csv without it",
-}
-"""An option of commands that read files."""
-START: dict[str, Any] = {
-    "type": int,
-    "default": 0,
-    "metavar": "FRAME",
-    "help": "first frame of the files that is read, from 0",
-}
-END: dict[str, Any] = {
-    "type": int,
-    "metavar": "FRAME",
-    "help": "frame of the files before which reading ends (default: all)",
-}
-"""Options that choose a part of what commands read, counted at the file's own rate."""
-PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
-"""An option that names a person, and may be repeated."""
-MOMENTS, SAME_PLACE = 30, 0.02
-"""Frames that are looked at, and metres between pelvises in all of them that no two bodies leave each other."""
-OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
 
 
 def path_to_write(out: str, inputs: Sequence[str] = (), size: Size | None = None, whole: bool = True) -> Path:
@@ -331,6 +329,14 @@ def refuse_unused(
     if not set(takes) & set(suffixes):
         named = " or ".join(dict.fromkeys(suffixes))
         raise CommandError(f"--{flag}: is for {', '.join(takes)}, and does nothing in {named}")
+
+
+def refuse_unused_look(options: argparse.Namespace, suffixes: Sequence[str]) -> None:
+    """Refuse what `add_look` was given where no film, picture or page is written; errors as of `refuse_unused`."""
+    from magnet.export.formats import FILM, PICTURES
+
+    refuse_unused(options, "style", "body", (".html", ".png", *PICTURES), suffixes)
+    refuse_unused(options, "size", FILM, PICTURES, suffixes)
 
 
 def say_other_body(model: DenoiserCore, body: str) -> None:

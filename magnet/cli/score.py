@@ -82,8 +82,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     Raises:
         CommandError: another number of samples, or no such checkpoint.
     """
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.cli.kept_checkpoints import told
+    from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.denoiser.core import DenoiserCore
     from magnet.evaluation import methods
     from magnet.evaluation.submission import Submission, answered
@@ -98,8 +97,7 @@ def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataMod
     if name in methods.BASELINES:
         method = methods.baseline(name, task, data)
     else:
-        found = find_checkpoint(given.method, [Path("runs")], option="--method")
-        denoiser = DenoiserCore.load(told(given.method, found, "--method"))
+        denoiser = DenoiserCore.load(checkpoint_of(given.method, "--method"))
         if said := other_body(denoiser, data.body.id, "fixed"):
             print(f"magnet: {said}", file=sys.stderr)
         method = methods.model(denoiser, task, data, samples, SamplerOptions.preset(given.sampler))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from magnet.checks import require_whole
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.cli.flags import of_preset, taken_out
-from magnet.plugins import Registered, told
+from magnet.plugins import Registered, summary, told
 from magnet.tasks import Task, registry
 from magnet.tasks.base import fault_of, schedule_of
 from magnet.version import __version__
@@ -163,8 +162,8 @@ def draw_tasks(console: Console) -> bool:
     faults = 0
     for entry in registry.entries():
         console.print(Text.assemble((entry.name, "bold cyan"), "  ", (origin(entry), "dim")))
-        first = (inspect.getdoc(entry.kind) or "").split("\n\n")[0].replace("\n", " ")
-        lines = [(str(getattr(entry.kind, "formula", "")), "magenta"), (first, ""), (options(entry.kind), "green")]
+        formula, fields = str(getattr(entry.kind, "formula", "")), options(entry.kind)
+        lines = [(formula, "magenta"), (summary(entry.kind), ""), (fields, "green")]
         if (fault := fault_of(entry.kind)) is not None:
             faults += 1
             lines.append((f"cannot be sampled: {fault}", "bold red"))

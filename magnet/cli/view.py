@@ -6,7 +6,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
@@ -225,8 +224,7 @@ def _watch(options: argparse.Namespace) -> Any:
 def _record(options: argparse.Namespace, scene: Any) -> None:
     import torch
 
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.cli.kept_checkpoints import told
+    from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.trace import record
     from magnet.motion.tokens import TOKEN_FRAMES
@@ -240,8 +238,7 @@ def _record(options: argparse.Namespace, scene: Any) -> None:
         schedule_of(task, Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
     except ValueError as error:
         raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
-    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
-    model = DenoiserCore.load(found)
+    model = DenoiserCore.load(checkpoint_of(options.ckpt_path))
     scene_files.say_other_body(model, scene.body)
     generator = torch.Generator().manual_seed(options.seed)
     sampler = sampler_options(options)
@@ -270,8 +267,7 @@ def _live(options: argparse.Namespace) -> Any:
     from magnet import checkpoints
     from magnet.body.base import load_body
     from magnet.body.floor import open_body
-    from magnet.cli.checkpoint_config import find_checkpoint
-    from magnet.cli.kept_checkpoints import told
+    from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.live import Live
     from magnet.motion.scene import Scene
@@ -290,8 +286,7 @@ def _live(options: argparse.Namespace) -> Any:
     examples = {} if own else {path.stem: path for path in sorted(folder.glob("*.npz"))}
     if start is None and options.people is None and examples:
         start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
-    found = told(options.ckpt_path, find_checkpoint(options.ckpt_path, [Path("runs")]))
-    model = DenoiserCore.load(found)
+    model = DenoiserCore.load(checkpoint_of(options.ckpt_path))
     scene_files.say_other_body(model, body.id)
     live = Live(
         model,

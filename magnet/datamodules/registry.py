@@ -13,7 +13,7 @@ from typing import TypeVar, get_args
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Family, Reader
-from magnet.plugins import Failed, Registered, Registry, attempted, look_here, told
+from magnet.plugins import Failed, Registered, Registry, attempted, look_here, subclasses, told
 
 BUILT_IN = (
     "synthetic",
@@ -156,9 +156,7 @@ def doubtful() -> dict[str, str]:
 
     A refused class is imported all the same, and a parser that looks through subclasses finds both.
     """
-    found: list[type] = [LightningDataModule]
-    for kind in found:
-        found.extend(kind.__subclasses__())
+    found = subclasses(LightningDataModule)
     return {
         name: f"{kind.__module__}.{kind.__qualname__}"
         for name, kind in classes().items()
