@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from magnet.baselines.predictor import Generators
-from magnet.cli import run_folder
+from magnet.cli import run_progress
 from magnet.cli.provenance import machine, provenance
 from magnet.cli.quiet import quiet
 from magnet.datamodules.cmu import CMU
@@ -108,7 +108,7 @@ def measure(
 ) -> Results:
     """One row, with the ground truth's beside it."""
     evaluator = (Replaced if replaced else Evaluator)(model, task, options, samples, baselines=False)
-    callbacks = [run_folder.progress_bar(sampling=True)]
+    callbacks = [run_progress.progress_bar(sampling=True)]
     silent = {"logger": False, "enable_checkpointing": False, "enable_model_summary": False}
     trainer = L.Trainer(accelerator="auto", precision=precision, callbacks=callbacks, **silent)  # type: ignore[arg-type]
     trainer.test(evaluator, datamodule=data, verbose=False)

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from magnet.datamodules.reading.recording import Reader
     from magnet.plugins import Registered
 
+SKIPPED_SHOWN, PROBLEMS_SHOWN, PERSONS_SHOWN, NOTES_SHOWN = 20, 40, 8, 8
+TUNING, WHERE_CONFIGS = "configs/finetune.yaml", "configs/ is in a clone of the repository"
+TUNED_HORIZON = 90
+"""Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
 BODIES = {
     "smplx": "--body SMPLX_NEUTRAL.npz",
     "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL",
@@ -99,15 +103,6 @@ def show(console: Console, what: str, text: str) -> None:
     from rich.text import Text
 
     console.print(Text.assemble((f"  {what:<16}", "dim"), text), soft_wrap=True)
-
-
-SKIPPED_SHOWN = 20
-TUNING, WHERE_CONFIGS = "configs/finetune.yaml", "configs/ is in a clone of the repository"
-TUNED_HORIZON = 90
-"""Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
-PROBLEMS_SHOWN = 40
-PERSONS_SHOWN = 8
-NOTES_SHOWN = 8
 
 
 def show_splits(splits: Mapping[str, Mapping[str, Any]], title: str | None = None) -> None:

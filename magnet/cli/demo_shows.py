@@ -13,7 +13,7 @@ from rich.console import Console
 
 from magnet import checkpoints
 from magnet.body import Body
-from magnet.cli import outputs, run_folder
+from magnet.cli import outputs, run_progress
 from magnet.cli.quiet import quiet
 from magnet.datamodules.options import HeldOutScenes
 from magnet.datamodules.synthetic import Synthetic
@@ -118,7 +118,7 @@ def measure(model: Denoiser, data: Synthetic, sampler: SamplerOptions, samples: 
         logger=False,
         enable_checkpointing=False,
         enable_model_summary=False,
-        callbacks=[run_folder.progress_bar(sampling=True)],
+        callbacks=[run_progress.progress_bar(sampling=True)],
     )
     trainer.test(evaluator, datamodule=data, verbose=False)
     assert evaluator.results is not None

@@ -21,7 +21,7 @@ def checkpoint_of(name: str | None, option: str = "--ckpt_path") -> Path:
     Raises:
         CommandError: there is none; says which there are.
     """
-    return told(name, find_checkpoint(name, [RUNS], option=option), option)
+    return say_which(name, find_checkpoint(name, [RUNS], option=option), option)
 
 
 def find_checkpoint(
@@ -83,7 +83,7 @@ def newest_of_runs(folders: Iterable[Path]) -> list[Path]:
     return sorted(files, key=written, reverse=True)[:NAMED]
 
 
-def told(name: str | None, found: Path, option: str = "--ckpt_path") -> Path:
+def say_which(name: str | None, found: Path, option: str = "--ckpt_path") -> Path:
     """The checkpoint that was found, of which a line says which it is where `last` or `best` was asked for."""
     if name in ("last", "best"):
         print(f"magnet: {option} {name} is {found}", file=sys.stderr)

@@ -17,9 +17,9 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, closest, refused
-from magnet.cli.misnamed import no_such_class
 from magnet.cli.named_files import unquoted
-from magnet.cli.nested import as_key, flat_key, in_files, no_class, place_of, with_place
+from magnet.cli.option_places import as_key, flat_key, in_files, no_class, place_of, with_place
+from magnet.cli.unknown_classes import no_such_class
 from magnet.plugins import summary
 
 USAGE = (

@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         given.configs,
         given.ckpt_path,
         plan.budget.speed_rounds,
-        told(provenance()["git"]),
+        short_commit(provenance()["git"]),
         own_data,
     )
     wanted = chosen(runner, cells, given.only or [""], given.skip)
@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     return int(bool(runner.failed))
 
 
-def told(git: Mapping[str, Any] | None) -> str:
+def short_commit(git: Mapping[str, Any] | None) -> str:
     """A state of the source tree: its short commit, and a plus where files were changed; empty where none is known."""
     return "" if git is None else git["commit"][:7] + "+" * git["changed"]
 

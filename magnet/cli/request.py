@@ -10,12 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from magnet import checkpoints
-from magnet.cli import checkpoint_config, class_options, config_files, going_on, nested, own_classes, run_folder
+from magnet.cli import (
+    checkpoint_config,
+    class_options,
+    config_files,
+    option_places,
+    own_classes,
+    resumed_trainer,
+    run_folder,
+)
 from magnet.cli.checkpoint_config import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import valued
-from magnet.cli.kept_checkpoints import RUNS, find_checkpoint, told
+from magnet.cli.kept_checkpoints import RUNS, find_checkpoint, say_which
 from magnet.cli.tasks import TaskChoice, named_task, parse_task, split_flags
 from magnet.datamodules import registry
 
@@ -71,11 +79,7 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     """
     given = Arguments.split(arguments)
     own_classes.import_named(given)
-    if doubtful := registry.doubtful():
-        given.flags = class_options.spelt_out_flags(given.flags, doubtful)
-        for each in given.layers:
-            if "data" in each.options:
-                each.options["data"] = class_options.spelt_out(each.options["data"], doubtful)
+    tell_apart(given)
     words = given.without("ckpt_path")
     fields, words = split_flags(words) if command in SAMPLING else ([], words)
     name, out = run_name(command, given.files), given.value("out")
@@ -83,44 +87,82 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     checkpoint = which_checkpoint(command, given, runs, name)
     if command == "fit":
         checkpoint_config.refuse_linked(given)
-    layer: dict[str, Any] = {}
-    if checkpoint is not None:
-        stored = checkpoint_config.Stored.read(checkpoint)
-        keep_data = given.value("ckpt_path") is not None
-        layer = checkpoint_config.defaults(stored, given, command == "fit", registry.default_path(), keep_data)
-        if command == "fit":
-            layer |= going_on.trained_with(checkpoint, given)
-    elif command == "fit" and (start := given.option("model", "start_from")):
-        layer = checkpoint_config.started(start, given, models, registry.default_path())
-    if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():
-        hint = (
-            "; files to go on from stand before --out: magnet predict A.bvh --out o.glb" if command == "predict" else ""
-        )
-        raise CommandError(
-            f"--out {out}: is a file's name, expected that of a folder; {command} writes several files{hint}"
-        )
+    below = options_below(command, given, checkpoint, models)
+    require_folder_name(command, out)
     folder = run_folder.run_folder(runs / name, out)
     preset, words = sampler_words(command, words)
     files = [named_task(each) for each in given.layers] if command in SAMPLING else given.layers
     files = [*files, *seed_of_samples(files, words)] if command in SAMPLING else files
-    settled = class_options.settle([Layer("", layer), *files, Layer("", preset)], [*words, *given.of("task")])
-    require_data(settled.classes.get("data"), [each.path for each in given.layers], words)
+    settled = class_options.settle([Layer("", below), *files, Layer("", preset)], [*words, *given.of("task")])
+    read = [each.path for each in given.layers]
+    require_data(settled.classes.get("data"), read, words)
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
-    task = None
-    if command in SAMPLING:
-        specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
-        named = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
-        try:
-            task = parse_task(named, fields, [spec.get("init_args") or {} for spec in specs], command)
-        except CommandError as error:
-            said = [*fields, *given.of("task")]
-            raise CommandError(nested.of_task([each.path for each in given.layers], said, str(error))) from error
-        task = replace(task, asked=bool(fields or given.of("task")))
+    task = sampled_task(command, given, fields, settled) if command in SAMPLING else None
     layers = [each.text() for each in settled.layers if each.options]
     asked = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
-    read, sampled = [each.path for each in given.layers], next(asked, None)
+    sampled = next(asked, None)
     return Request(command, words, layers, read, checkpoint, folder, not out, settled.classes, task, sampled)
+
+
+def tell_apart(given: Arguments) -> None:
+    """Write short names of data sets that several classes have as dotted paths, in flags and files."""
+    if paths := registry.doubtful():
+        given.flags = class_options.spelt_out_flags(given.flags, paths)
+        for each in given.layers:
+            if "data" in each.options:
+                each.options["data"] = class_options.spelt_out(each.options["data"], paths)
+
+
+def options_below(command: str, given: Arguments, checkpoint: Path | None, models: dict[str, str]) -> dict[str, Any]:
+    """The lowest layer of options: those of the checkpoint, or of the one that a new training starts from.
+
+    Raises:
+        CommandError: no such checkpoint, or one that cannot be taken.
+    """
+    fit, data = command == "fit", registry.default_path()
+    if checkpoint is None:
+        start = given.option("model", "start_from") if fit else None
+        return checkpoint_config.started(start, given, models, data) if start else {}
+    stored = checkpoint_config.Stored.read(checkpoint)
+    layer = checkpoint_config.defaults(stored, given, fit, data, keep_data=given.value("ckpt_path") is not None)
+    return layer | resumed_trainer.trained_with(checkpoint, given) if fit else layer
+
+
+def require_folder_name(command: str, out: str | None) -> None:
+    """Refuse the name of a file for a run's folder.
+
+    Raises:
+        CommandError: says what is expected.
+    """
+    if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():
+        first = "; files to go on from stand before --out: magnet predict A.bvh --out o.glb"
+        hint = first if command == "predict" else ""
+        raise CommandError(
+            f"--out {out}: is a file's name, expected that of a folder; {command} writes several files{hint}"
+        )
+
+
+def sampled_task(command: str, given: Arguments, fields: list[str], settled: class_options.Settled) -> TaskChoice:
+    """The task that is sampled; its options are taken out of the layers.
+
+    Args:
+        command: whose help is named in errors.
+        given: what the user says.
+        fields: flags of the task's options.
+        settled: all layers.
+
+    Raises:
+        CommandError: no such task or option, or a value that does not fit.
+    """
+    specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
+    name = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
+    said = [*fields, *given.of("task")]
+    try:
+        task = parse_task(name, fields, [spec.get("init_args") or {} for spec in specs], command)
+    except CommandError as error:
+        raise CommandError(option_places.of_task([each.path for each in given.layers], said, str(error))) from error
+    return replace(task, asked=bool(said))
 
 
 def require_data(name: str | None, files: list[str], flags: list[str]) -> None:
@@ -136,7 +178,7 @@ def require_data(name: str | None, files: list[str], flags: list[str]) -> None:
         registry.DATA.require_loaded(name)
     except ValueError as error:
         raise CommandError(str(error)) from error
-    raise CommandError(nested.no_class(files, flags, "data", name, known))
+    raise CommandError(option_places.no_class(files, flags, "data", name, known))
 
 
 def run_name(command: str, files: list[str]) -> str:
@@ -163,7 +205,7 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
         return find_checkpoint(str(found), [Path(out) if out else runs / run], runs)
     folders = [Path(out or runs), runs / run, runs]
     found = find_checkpoint(name, folders, runs)
-    return told(name, found) if run_folder.first_process() else found
+    return say_which(name, found) if run_folder.first_process() else found
 
 
 def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:

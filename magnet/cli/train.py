@@ -19,7 +19,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
-from magnet.cli import answers, checkpoint_config, optimizers, outputs, own_folder, run_folder, run_logs, run_record
+from magnet.cli import answers, checkpoint_config, folder_lock, optimizers, outputs, run_folder, run_logs, run_record
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.interrupts import EndOfStep
@@ -27,6 +27,7 @@ from magnet.cli.parser import Parser
 from magnet.cli.quiet import quiet
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
 from magnet.cli.run_numbers import require_numbers
+from magnet.cli.run_progress import progress_bar
 from magnet.cli.tasks import TaskChoice
 from magnet.datamodules import registry
 from magnet.datamodules.base import MotionDataModule
@@ -247,14 +248,14 @@ class MagnetCLI(LightningCLI):
         callbacks = as_list(config.get("callbacks"))
         fit = self.command == "fit"
         if fit and not config.get("fast_dev_run"):
-            self.held.enter_context(own_folder.held(self.folder))
+            self.held.enter_context(folder_lock.held(self.folder))
         if fit and config.get("enable_checkpointing") is not False and not config.get("fast_dev_run"):
             if not self._goes_on:
-                own_folder.refuse_overwriting(self.folder)
+                folder_lock.refuse_overwriting(self.folder)
             callbacks += run_folder.checkpoints(self.folder, self.model, callbacks)
         if config.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
             sampling = self.command in SAMPLING and isinstance(self.model, TokenModel)
-            callbacks.append(run_folder.progress_bar(sampling))
+            callbacks.append(progress_bar(sampling))
         logger = run_logs.loggers(self.folder, config.get("logger"), self._option("wandb"), fit, self._goes_on)
         if fit and logger and not any(isinstance(c, LearningRateMonitor) for c in callbacks):
             callbacks.append(LearningRateMonitor(logging_interval="step"))

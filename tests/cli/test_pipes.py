@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from magnet.cli import run_folder
+from magnet.cli import run_progress
 from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +71,7 @@ def test_a_run_goes_on_where_nobody_reads_its_progress(monkeypatch: pytest.Monke
     os.close(reads)
     with os.fdopen(writes, "w") as unread_output:
         monkeypatch.setattr(sys, "stdout", unread_output)
-        lines = run_folder.ProgressLines(seconds=0.0)
+        lines = run_progress.ProgressLines(seconds=0.0)
         for done in (1, 2, 3):
             lines.tell("test: denoising step", done, 3)
         print("the table", flush=True)

@@ -18,7 +18,6 @@ from magnet.datamodules.reading.recording import Axis, DataError, Recording
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-FEET = ((7, 10), (8, 11))
 WALKING = [PELVIS, L_ANKLE, L_FOOT, R_ANKLE, R_FOOT]
 """Joints that tell the frame rate: the pelvis, then each foot's two."""
 TURN = 2 * math.pi * 1.05
@@ -151,7 +150,7 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
     Raises:
         DataError: people are too far from each other, from the floor or from where they were.
     """
-    lowest = joints[:, :, [j for foot in FEET for j in foot], 1].min(axis=-1)
+    lowest = joints[:, :, WALKING[1:], 1].min(axis=-1)
     bob = float(np.ptp(np.percentile(lowest[valid], [5, 95])))
     here = pelvis[valid]
     span = float(np.ptp(np.percentile(here, [1, 99], axis=0), axis=0).max())

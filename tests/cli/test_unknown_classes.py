@@ -9,7 +9,7 @@ import pytest
 
 import magnet.callbacks
 from magnet import cli
-from magnet.cli.misnamed import OURS
+from magnet.cli.unknown_classes import OURS
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:

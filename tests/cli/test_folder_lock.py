@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from magnet import cli
-from magnet.cli import own_folder
+from magnet.cli import folder_lock
 from magnet.files import Taken, alone
 from tests.toys import ToyModel
 
@@ -31,7 +31,7 @@ input()
 def test_a_second_training_in_a_folder_is_refused_while_the_first_one_works(
     toy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lock = toy / "two" / own_folder.LOCK
+    lock = toy / "two" / folder_lock.LOCK
     lock.parent.mkdir()
     with subprocess.Popen(
         [sys.executable, "-c", HOLDS, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -40,7 +40,7 @@ def test_a_second_training_in_a_folder_is_refused_while_the_first_one_works(
         assert cli.main(FIT) == 2
         told = capsys.readouterr().err.splitlines()[-1]
         assert told == "magnet fit: error: another training is working in two; wait for it, or choose another --out"
-        assert [path.name for path in (toy / "two").iterdir()] == [own_folder.LOCK]
+        assert [path.name for path in (toy / "two").iterdir()] == [folder_lock.LOCK]
         other.communicate(b"\n")
     assert cli.main(FIT) == 0
     assert not lock.exists()
@@ -52,14 +52,14 @@ def test_the_lock_is_held_while_training_and_by_the_first_process_alone(
 ) -> None:
     seen = []
     monkeypatch.setattr(
-        ToyModel, "on_train_start", lambda self: seen.append((toy / "two" / own_folder.LOCK).exists()), raising=False
+        ToyModel, "on_train_start", lambda self: seen.append((toy / "two" / folder_lock.LOCK).exists()), raising=False
     )
     assert cli.main(FIT) == 0 and seen == [True]
     monkeypatch.setenv("LOCAL_RANK", "1")
-    with alone(toy / own_folder.LOCK, "taken"), own_folder.held(toy):
+    with alone(toy / folder_lock.LOCK, "taken"), folder_lock.held(toy):
         pass
     monkeypatch.delenv("LOCAL_RANK")
-    with own_folder.held(toy / "never" / "began"):
+    with folder_lock.held(toy / "never" / "began"):
         assert (toy / "never" / "began").is_dir()
     assert not (toy / "never").exists()
 
@@ -74,9 +74,9 @@ def test_the_locks_file_goes_while_the_lock_is_held(tmp_path: Path, monkeypatch:
             yield
             seen.append(lock.exists())
 
-    monkeypatch.setattr(own_folder, "alone", watched)
-    with own_folder.held(tmp_path / "two"):
-        assert (tmp_path / "two" / own_folder.LOCK).exists()
+    monkeypatch.setattr(folder_lock, "alone", watched)
+    with folder_lock.held(tmp_path / "two"):
+        assert (tmp_path / "two" / folder_lock.LOCK).exists()
     # Windows removes no file that is open: there filelock removes it as it lets go.
     assert seen == [os.name == "nt"] and not (tmp_path / "two").exists()
 
@@ -84,7 +84,7 @@ def test_the_locks_file_goes_while_the_lock_is_held(tmp_path: Path, monkeypatch:
 def test_a_lock_whose_file_is_removed_meanwhile_is_not_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its last holder removed it between this process's opening it and locking it."""
     fcntl = pytest.importorskip("fcntl")
-    flock, lock = fcntl.flock, tmp_path / own_folder.LOCK
+    flock, lock = fcntl.flock, tmp_path / folder_lock.LOCK
 
     def late(fd: int, how: int) -> None:
         if how & fcntl.LOCK_EX:
@@ -100,7 +100,7 @@ def test_a_training_runs_without_a_lock_where_there_are_none(toy: Path, monkeypa
     def none(*_: object) -> None:
         raise OSError(38, "Function not implemented")
 
-    monkeypatch.setattr(own_folder, "alone", none)
+    monkeypatch.setattr(folder_lock, "alone", none)
     assert cli.main(FIT) == 0
 
 

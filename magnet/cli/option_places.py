@@ -188,14 +188,15 @@ def no_class(
 
 def of_task(files: Sequence[str], flags: Sequence[str], told: str) -> str:
     """A sentence on a task, its option or a value, such as `no option --task.FIELD`, with its place in a file."""
+    given = {name for name, _ in valued(flags)}  # which files do not change
     if unknown := re.match(r"no task named (\w+)", told):
-        given = any(name in ("--task", "--task.class_path") for name, _ in valued(flags))
-        found = None if given else in_files(files, "task.class_path") or in_files(files, "task", unknown[1])
-        found = found or (None if given else in_files(files, "task.name", unknown[1]))
+        if given & {"--task", "--task.class_path"}:
+            return told
+        keys = (("task.class_path", None), ("task", unknown[1]), ("task.name", unknown[1]))
+        found = next(filter(None, (in_files(files, key, got) for key, got in keys)), None)
         return f"{': '.join(found)}: {told}" if found else told
-    match = re.match(r"no option --(task\.\w+)", told)
-    if match is None:
+    option = re.match(r"no option --(task\.\w+)", told)
+    if option is None:
         return with_place((), files, flags, told)
-    given = any(name == f"--{match[1]}" for name, _ in valued(flags))
-    found = None if given else in_files(files, match[1])
+    found = None if f"--{option[1]}" in given else in_files(files, option[1])
     return f"{found[0]}: {as_key(told)}" if found else told

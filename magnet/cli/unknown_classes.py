@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from magnet.cli.nested import no_class
+from magnet.cli.option_places import no_class
 from magnet.plugins import subclasses
 
 OURS = {
