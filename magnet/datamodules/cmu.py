@@ -14,7 +14,7 @@ from lightning.pytorch.utilities import rank_zero_warn
 
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.prepared import Prepared
-from magnet.datamodules.preparing.fit_cache import FitCache, Steps, fit_whole
+from magnet.datamodules.preparing.fit_cache import FitCache, Steps, cache_folder, fit_whole
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import Glitches, check_rate, measured
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
@@ -276,7 +276,6 @@ class CMU(Prepared):
     @cached_property
     def fits(self) -> FitCache:
         """Fitted takes, and a report of each."""
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet" / "cmu"
         reader = self.recordings
 
         def fit(take: Take, progress: Steps) -> tuple[Scene, dict[str, Any]]:
@@ -285,7 +284,7 @@ class CMU(Prepared):
         def facts(take: Take) -> tuple[Any, ...]:
             return FIT_VERSION, self.body.id, reader.rates(take), reader.trim
 
-        return FitCache(Path(self.cache).expanduser() if self.cache else folder, self.body, facts, fit)
+        return FitCache(cache_folder(self.cache, "cmu"), self.body, facts, fit)
 
     def prepare_data(self) -> None:
         """Fit takes that are not in the cache; for a store, check that it exists and belongs to this body.

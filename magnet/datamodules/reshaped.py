@@ -16,6 +16,7 @@ from magnet.body.other_shapes import with_shapes
 from magnet.datamodules.base import Clip, MotionDataModule, Split, clips_of
 from magnet.datamodules.clip import RESHAPED, at_least
 from magnet.datamodules.mixed import Parts
+from magnet.datamodules.preparing.fit_cache import cache_folder
 from magnet.datamodules.preparing.progress import progress_bar
 from magnet.datamodules.registry import register_data
 from magnet.datamodules.store.reader import body_hash
@@ -70,8 +71,7 @@ class Reshaped(Parts):
     @property
     def folder(self) -> Path:
         """Where scenes are kept."""
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        return Path(self.cache).expanduser() if self.cache else home / "magnet" / "reshaped"
+        return cache_folder(self.cache, "reshaped")
 
     def prepare_data(self) -> None:
         """Make the scenes that are not in the cache.

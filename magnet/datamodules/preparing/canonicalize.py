@@ -140,7 +140,11 @@ def canonicalize(
     notes += off_their_floor([height - floor for height in heights], names)
     motion = motion.lowered(floor)
     cuts = sorted({*jumps.tolist(), *(flag.start for flag in flags if flag.cut)})
-    return Canonicalized(_cut(motion, cuts, flagged, body, name, source, split, options.min_frames), tuple(notes))
+    clips = []
+    for start, stop in _stretches(motion.valid, cuts, flagged, options.min_frames):
+        label = name if (start, stop) == (0, len(motion.valid)) else f"{name} [{start}:{stop}]"
+        clips.append(Clip(_scene(motion, start, stop, body, label), label, source, split))
+    return Canonicalized(clips, tuple(notes))
 
 
 def _moved(recording: Recording, body: Body, options: CanonicalizeOptions) -> tuple[WorldMotion, list[Flag], list[str]]:
@@ -237,13 +241,12 @@ def _fitted(
     check_motion.check_up(up, spread, good, chosen=options.up is not None)
     flags += check_people.jumps(None, spread, good)
     spread = spread @ R_WORLD_FILE[up].numpy().T
-    if np.isfinite(spread[:, :, check_motion.WALKING]).all():
+    walking = spread[:, :, check_motion.WALKING]
+    if np.isfinite(walking).all():
         check_motion.check_apart(spread[:, :, 0], good)
         check_motion.check_lengths(spread, spread[:, :, 0], good)
-    if not options.trust_fps and np.isfinite(spread[:, :, check_motion.WALKING]).all():
-        check_motion.check_rate(
-            spread[:, :, check_motion.WALKING], good, recording.said_fps or recording.fps, FPS
-        )  # before a fit of minutes
+        if not options.trust_fps:  # before a fit of minutes
+            check_motion.check_rate(walking, good, recording.said_fps or recording.fps, FPS)
     targets = (points @ R_WORLD_FILE[up].T).float()
     try:
         if recording.skeletons:
@@ -305,42 +308,41 @@ def fit_positions(
 # -- cutting -----------------------------------------------------------------------------------
 
 
-def _cut(
-    motion: WorldMotion,
-    cuts: list[int],
-    flagged: list[str],
-    body: Body,
-    name: str,
-    source: str,
-    split: Split,
-    least: int,
-) -> list[Clip]:
-    together: NDArray[np.bool_] = np.logical_and.reduce(motion.valid, axis=1)
+def _stretches(valid: NDArray[np.bool_], cuts: list[int], flagged: list[str], least: int) -> list[tuple[int, int]]:
+    """First frames, and frames after the last, of what is left between cuts where everybody is valid.
+
+    Args:
+        valid: (T, P).
+        cuts: frames that begin a stretch of their own.
+        flagged: what was wrong, for messages.
+        least: frames of a stretch.
+
+    Raises:
+        DataError: nothing is left.
+    """
+    together: NDArray[np.bool_] = np.logical_and.reduce(valid, axis=1)
     frames = len(together)
-    stretches: list[tuple[int, int]] = []
-    edges = [0, *cuts, frames]
-    for first, end in pairwise(edges):
-        stretches += [(first + a, first + b) for a, b in true_runs(together[first:end], least)]
-    if not stretches:
+    parts = pairwise([0, *cuts, frames])
+    found = [(first + a, first + b) for first, end in parts for a, b in true_runs(together[first:end], least)]
+    if not found:
         raise DataError(
             f"no stretch of {least} frames at 30 fps where everybody is tracked: {frames} frames, "
             f"{int(together.sum())} of them valid{''.join(f'; {one}' for one in flagged)}; lower --min_frames to keep "
             f"shorter ones"
         )
-    clips = []
-    for start, stop in stretches:
-        label = name if (start, stop) == (0, frames) else f"{name} [{start}:{stop}]"
-        pelvis = motion.pelvis[start:stop]
-        origin = pelvis[0].mean(dim=0) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
-        rotations = motion.rotations[start:stop]
-        scene = Scene(
-            body_rot=rotations[None, :, :, 1:],
-            T_world_root=rigid(rotations[:, :, 0], (pelvis - origin).float())[None],
-            betas=motion.betas.float()[None],
-            present=torch.ones(1, len(motion.betas), dtype=torch.bool),
-            fps=FPS,
-            body=body.id,
-            names=(label,),
-        )
-        clips.append(Clip(scene, label, source, split))
-    return clips
+    return found
+
+
+def _scene(motion: WorldMotion, start: int, stop: int, body: Body, label: str) -> Scene:
+    """Frames `start:stop`, at first about the origin."""
+    rotations, pelvis = motion.rotations[start:stop], motion.pelvis[start:stop]
+    origin = pelvis[0].mean(dim=0) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+    return Scene(
+        body_rot=rotations[None, :, :, 1:],
+        T_world_root=rigid(rotations[:, :, 0], (pelvis - origin).float())[None],
+        betas=motion.betas.float()[None],
+        present=torch.ones(1, len(motion.betas), dtype=torch.bool),
+        fps=FPS,
+        body=body.id,
+        names=(label,),
+    )

@@ -16,9 +16,10 @@ from magnet.body import Body, load_body
 from magnet.datamodules import registry
 from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing import check_people
-from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, Progress, convert_all
+from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert_all
 from magnet.datamodules.preparing.pack import split_counts
 from magnet.datamodules.preparing.prepare import absent_note, select_takes, summary_of
+from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.fields import listing
 from magnet.datamodules.reading.own import FEW, OwnReader, seconds_needed
 from magnet.datamodules.reading.own_files import of_others
@@ -69,7 +70,7 @@ def noted(note: str, takes: list[str]) -> str:
 # -- a store -----------------------------------------------------------------------------------
 
 
-def check_store(folder: StoreReader, body: Body | None = None, progress: Progress | None = None) -> CheckReport:
+def check_store(folder: StoreReader, body: Body | None = None, progress: Tell | None = None) -> CheckReport:
     """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
 
     Args:
@@ -221,7 +222,7 @@ def check_download(
     workers: int = 1,
     splits: dict[str, Split] | None = None,
     limit: int | None = None,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
 ) -> CheckReport:
     """Every take of a download read and canonicalized; nothing is written.
 

@@ -233,10 +233,7 @@ def without(valid: Bools, flags: Sequence[Flag], names: Sequence[str], fps: floa
             left[flag.start : flag.stop, flag.person] = False
     for person in np.flatnonzero(~left.any(axis=0)).tolist():
         mine = [flag for flag in flags if flag.person == person]
-        raise DataError(
-            f"{'; '.join(described(mine, names, fps))}: nothing is left; tracking was lost: "
-            f"leave the take out, or take the file as it was published"
-        )
+        raise DataError(f"{'; '.join(described(mine, names, fps))}: nothing is left; tracking was lost: {AGAIN}")
     return left
 
 

@@ -26,6 +26,7 @@ from magnet.datamodules import registry
 from magnet.datamodules.preparing.canonicalize import CANONICALIZE_VERSION, CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check_people import check_shapes
 from magnet.datamodules.preparing.genders import load_bodies, one_body
+from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.recording import DataError, Gender, Reader, Take
 from magnet.datamodules.store.reader import FORMAT, body_hash
 from magnet.datamodules.store.rows import ROW, encode
@@ -321,10 +322,6 @@ def work(take: Take, path: Path | None) -> ConvertedTake:
     return part if path is None else part.saved(path)
 
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many bytes of the download are done, and how many there are."""
-
-
 def sizes(takes: Sequence[Take]) -> dict[str, int]:
     """Bytes of each take's files, by name; at least 1."""
     return {take.name: 1 + sum(path.stat().st_size for path in take.files if path.is_file()) for take in takes}
@@ -335,9 +332,11 @@ def convert_all(
     takes: list[Take],
     file: Callable[[Take], Path | None],
     workers: int,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
 ) -> Iterator[tuple[Take, ConvertedTake]]:
     """Make the parts of all takes as they are done, each on disk, whole, where `file` says; in any order.
+
+    `progress` is told of bytes of the download.
 
     Raises:
         OSError: a worker process died.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +35,13 @@ HELD = 0.20
 ADVICE = "give another --data.cache; then run the same command again, which keeps fitted takes"
 Steps = Callable[[int, int], None]
 """Called with the steps of a fit that are done, and how many there are."""
+
+
+def cache_folder(named: str | None, name: str) -> Path:
+    """The folder that somebody named to keep what takes long to make, or else one in the user's cache."""
+    if named:
+        return Path(named).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet" / name
 
 
 def fit_whole(

@@ -35,15 +35,13 @@ class PackSource:
         split, first, count = self.place["split"], self.place["first"], self.place["clips"]
         part = old.split(split)
         mine = range(first, first + count)
-        end = np.cumsum(part.people)
-        low = int(end[first] - part.people[first])
         return ConvertedTake(
             error=None,
             notes=tuple(self.place["notes"]),
             names=tuple(part.name[c] for c in mine),
             frames=tuple(int(part.frames[c]) for c in mine),
             people=tuple(int(part.people[c]) for c in mine),
-            betas=np.array(part.betas[low : int(end[first + count - 1])]),
+            betas=np.concatenate([part.betas_of(c) for c in mine]),
             rows=np.concatenate([part.rows(c).reshape(-1) for c in mine]) if rows else np.zeros(0, dtype=ROW),
             persons=part.persons[first],
         )

@@ -15,12 +15,12 @@ from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing.convert import (
     ConvertedTake,
     PrepareJob,
-    Progress,
     convert_all,
     named_errors,
     take_key,
 )
 from magnet.datamodules.preparing.pack import PackSource, pack
+from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
 from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
@@ -48,7 +48,7 @@ def prepare(
     splits: dict[str, Split] | None = None,
     limit: int | None = None,
     shard_rows: int = SHARD_ROWS,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
 ) -> PrepareReport:
     """Make or bring up to date the store at `out`.
 

@@ -120,15 +120,13 @@ class RandomWindows:
             members, groups = np.take_along_axis(members, order, 1), np.take_along_axis(groups, order, 1)
 
         clips = np.stack([a, np.where(joining > 0, b, -1)], axis=1)
-        low, high = augment.compose_apart
-        relative_pose = np.stack([u[:, 8] * 2 * np.pi, u[:, 9] * 2 * np.pi, low + u[:, 10] * (high - low)], axis=1)
         windows = WindowIndex(
             clips,
             np.stack([start_a, start_b], axis=1),
             members,
             groups,
             u[:, 11] < (0.5 if augment.mirror else 0.0),
-            relative_pose,
+            relative_poses(u[:, 8:11], augment.compose_apart),
         )
         return without_empty_groups(windows)
 
@@ -146,6 +144,12 @@ def slot_assignment(first: Ints, joining: Ints, second: Ints, turn: Ints, slots:
     later = slot - first[:, None]
     members = np.where(later < joining[:, None], (later + turn[:, None]) % second[:, None], -1)
     return np.where(later < 0, slot, members), (later >= 0).astype(np.int64)
+
+
+def relative_poses(u: Floats, apart: tuple[float, float]) -> Floats:
+    """Where second groups stand: yaw, direction, and a distance within `apart`. (B, 3) uniform -> (B, 3)"""
+    low, high = apart
+    return np.stack([u[:, 0] * 2 * np.pi, u[:, 1] * 2 * np.pi, low + u[:, 2] * (high - low)], axis=1)
 
 
 def dropped(people: int, at_most: int, share: float, which: float) -> list[int]:
@@ -281,12 +285,11 @@ def composed_windows(
     wanted = np.array([sizes[k % len(sizes)] for k in range(count)], dtype=np.int64)
     turn = (u[:, 1] * people[second]).astype(np.int64)
     members, groups = slot_assignment(people[first], wanted - people[first], people[second], turn, store.max_agents)
-    low, high = apart
     return WindowIndex(
         clips=np.stack([plain.clips[first, 0], plain.clips[second, 0]], axis=1),
         starts=np.stack([plain.starts[first, 0], plain.starts[second, 0]], axis=1),
         members=members,
         groups=groups,
         mirrored=np.zeros(count, dtype=bool),
-        relative_pose=np.stack([u[:, 2] * 2 * np.pi, u[:, 3] * 2 * np.pi, low + u[:, 4] * (high - low)], axis=1),
+        relative_pose=relative_poses(u[:, 2:5], apart),
     )
