@@ -7,7 +7,7 @@ import torch
 import yaml
 
 from magnet import checkpoints
-from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.arguments import Arguments
 from magnet.cli.config_files import read_layers
 from magnet.denoiser.module import Denoiser
 from magnet.old_names import (

@@ -6,114 +6,23 @@ checkpoints is switched off: a checkpoint's options become the lowest layer, and
 
 from __future__ import annotations
 
-import importlib
 import pickle
 import sys
 import textwrap
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from magnet import checkpoints
-from magnet.cli.class_options import class_in_flags, one_class, same_class, spec_of
-from magnet.cli.config_files import Layer, read_layers
+from magnet.cli.arguments import Arguments
+from magnet.cli.class_names import chosen, class_named, class_paths, options_of, same_class
 from magnet.cli.errors import CommandError
-from magnet.cli.flags import taken_out
 from magnet.motion.tokens import TOKEN_FRAMES
-from magnet.old_names import renamed_flags, told
-from magnet.plugins import subclasses
 
 Spec = dict[str, Any]
 """A class and its options: {"class_path": ..., "init_args": {...}}."""
 
-CONFIG_FLAGS = ("--config", "-c")
-SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
 CONFIG_KEY = "magnet_config"
-
-
-@dataclass
-class Arguments:
-    """A command line after the command, with what its configuration files say."""
-
-    flags: list[str]
-    files: list[str] = field(default_factory=list)
-    layers: list[Layer] = field(default_factory=list)
-
-    @classmethod
-    def split(cls, arguments: Iterable[str]) -> Arguments:
-        """Take the configuration files out, so that they go first and any flag beats any file.
-
-        Raises:
-            CommandError: as `read_layers`.
-        """
-        found = cls([])
-        rest = iter(arguments)
-        for argument in rest:
-            name, equals, value = argument.partition("=")
-            if name in CONFIG_FLAGS:
-                found.files.append(value if equals else next(rest, ""))
-            else:
-                found.flags.append(argument)
-        found.layers = [layer for file in found.files for layer in read_layers(file)]
-        found.flags, changed = renamed_flags(one_class(found.flags), found.class_of("model"))
-        if changed:
-            print(f"magnet: {told(changed)}", file=sys.stderr)
-        return found
-
-    @property
-    def configs(self) -> list[dict[str, Any]]:
-        """What the files say, and those that they extend; later ones win."""
-        return [layer.options for layer in self.layers]
-
-    def flag(self, key: str) -> str | None:
-        """The value of a flag; of several the last.
-
-        Raises:
-            CommandError: the flag is the last word, without a value.
-        """
-        value = None
-        for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):
-            name, equals, text = argument.partition("=")
-            if name == f"--{key}":
-                value = text if equals else after
-                if value is None:
-                    raise CommandError(f"--{key}: got nothing, expected a value behind it")
-        return value
-
-    def value(self, key: str) -> Any:
-        """What a flag says, else the last configuration file that says something; None where nobody does."""
-        flag = self.flag(key)
-        if flag is not None:
-            return None if flag == "null" else flag
-        return next((config[key] for config in reversed(self.configs) if config.get(key) is not None), None)
-
-    @property
-    def only_shown(self) -> bool:
-        """Whether the configuration or help is asked for, and nothing is run."""
-        return any(flag.startswith(SHOWN) for flag in self.flags)
-
-    def class_of(self, key: str) -> str | None:
-        """The class that the user asks for under `model`, `data` or `task`."""
-        named = (spec_of(config.get(key)).get("class_path") for config in reversed(self.configs))
-        return class_in_flags(self.flags, key) or next((name for name in named if name), None)
-
-    def option(self, key: str, name: str) -> Any:
-        """An option of the class under `model` or `data`: by a flag, else by the last file that says something."""
-        flag = self.flag(f"{key}.{name}") or self.flag(f"{key}.init_args.{name}")
-        if flag is not None:
-            return None if flag == "null" else flag
-        parts = [config[key] for config in reversed(self.configs) if isinstance(config.get(key), dict)]
-        return next((value for part in parts if (value := (part.get("init_args") or {}).get(name)) is not None), None)
-
-    def of(self, key: str) -> list[str]:
-        """The flags that name a class under a key, with their values."""
-        value = class_in_flags(self.flags, key)
-        return [] if value is None else [f"--{key}", value]
-
-    def without(self, key: str) -> list[str]:
-        """The flags, less one and its value."""
-        return taken_out(self.flags, rf"--{key}(=|$)")[1]
 
 
 @dataclass(frozen=True)
@@ -278,26 +187,6 @@ def refuse_linked(given: Arguments) -> None:
             raise CommandError(f"model.{target} follows from the data when a model is trained: set --data.{source}")
 
 
-def class_named(path: str) -> type | None:
-    """The class of a dotted path, or of the short name of one that is imported."""
-    module, _, name = path.rpartition(".")
-    if module:
-        return getattr(importlib.import_module(module), name, None)
-    from lightning.pytorch import LightningDataModule
-
-    return next((kind for kind in subclasses(LightningDataModule) if kind.__name__ == path), None)
-
-
-def options_of(kind: type | None) -> set[str]:
-    """Names of all options of a class, inherited ones included."""
-    if kind is None:
-        return set()
-    from lightning.pytorch.cli import LightningArgumentParser
-
-    parser = LightningArgumentParser()
-    return {name.split(".")[1] for name in parser.add_class_arguments(kind, "it", fail_untyped=False)}
-
-
 def trusted(spec: Spec, path: Path) -> Spec:
     """Refuse classes whose import could run code that nobody here has chosen.
 
@@ -311,23 +200,6 @@ def trusted(spec: Spec, path: Path) -> Spec:
                 "with --model or --data"
             )
     return spec
-
-
-def chosen(name: str) -> bool:
-    """Whether a class is ours, Lightning's or torch's, or of a module that is imported already."""
-    module = name.rpartition(".")[0]
-    return module.partition(".")[0] in ("magnet", "lightning", "torch") or module in sys.modules
-
-
-def class_paths(value: Any) -> Iterable[str]:
-    if isinstance(value, dict):
-        if isinstance(value.get("class_path"), str):
-            yield value["class_path"]
-        for part in value.values():
-            yield from class_paths(part)
-    elif isinstance(value, list):
-        for part in value:
-            yield from class_paths(part)
 
 
 def known_options(spec: Spec, key: str) -> Spec:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import copy
 import json
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from typing import Any
 
 import yaml
 
+from magnet.cli.class_names import same_class
 from magnet.cli.config_files import Layer
 from magnet.cli.flags import Options, class_in_flags, spec_of, valued
 
@@ -108,17 +108,6 @@ def spelt_out_flags(flags: Sequence[str], paths: Mapping[str, str]) -> list[str]
         else:
             found.append(text(before, word) if "=" not in before else word)
     return found
-
-
-def same_class(one: str, other: str) -> bool:
-    """Whether two names, short or dotted, mean one class; nothing is imported to find out."""
-    if one == other:
-        return True
-    if "." in one and "." in other:
-        parts = [path.rpartition(".") for path in (one, other)]
-        here, there = (getattr(sys.modules.get(module), name, None) for module, _, name in parts)
-        return here is not None and here is there
-    return one.rpartition(".")[2] == other.rpartition(".")[2]
 
 
 def _only(layers: list[Layer], specs: list[Options], key: str, winner: str) -> list[str]:

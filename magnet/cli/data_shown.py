@@ -6,7 +6,7 @@ import argparse
 import re
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -15,6 +15,7 @@ from magnet.cli import answers
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from magnet.datamodules.preparing.progress import Tell
     from magnet.datamodules.reading.recording import Reader
     from magnet.plugins import Registered
 
@@ -213,7 +214,7 @@ def shorter_tests(longest: int, horizon: int) -> str:
     return f" --data.test.horizon_frames {rest}" if 0 < rest < horizon else ""
 
 
-def file_bars() -> AbstractContextManager[Callable[[str, int, int | None], None]]:
+def file_bars() -> AbstractContextManager[Tell]:
     """A progress bar of the file that is being fetched."""
     from rich.progress import DownloadColumn, TransferSpeedColumn
 

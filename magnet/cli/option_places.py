@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from magnet.cli.checkpoint_config import class_named, options_of
+from magnet.cli.class_names import class_named, options_of
 from magnet.cli.flags import valued
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import yaml
 
-from magnet.cli.checkpoint_config import Arguments, chosen, class_paths
+from magnet.cli.arguments import Arguments
+from magnet.cli.class_names import chosen, class_paths
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import valued
 from magnet.plugins import look_here

@@ -19,7 +19,7 @@ from magnet.cli import (
     resumed_trainer,
     run_folder,
 )
-from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.arguments import Arguments
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import valued

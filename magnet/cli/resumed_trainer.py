@@ -9,7 +9,8 @@ from typing import Any
 
 from lightning.pytorch import Trainer
 
-from magnet.cli.checkpoint_config import Arguments, chosen, class_paths
+from magnet.cli.arguments import Arguments
+from magnet.cli.class_names import chosen, class_paths
 from magnet.cli.config_files import read_layers
 from magnet.cli.errors import CommandError
 

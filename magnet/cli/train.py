@@ -20,6 +20,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from magnet import checkpoints
 from magnet.cli import answers, checkpoint_config, folder_lock, optimizers, outputs, run_folder, run_logs, run_record
+from magnet.cli.class_names import class_named
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import help_topic
 from magnet.cli.interrupts import EndOfStep
@@ -227,7 +228,7 @@ class MagnetCLI(LightningCLI):
         kind = parser.classes[key].get(name)
         path = name if kind is None else f"{kind.__module__}.{kind.__qualname__}"
         try:
-            there = checkpoint_config.class_named(path) is not None
+            there = class_named(path) is not None
         except ImportError:
             there = False
         if there or otherwise:  # of a class that is not there the parser says so

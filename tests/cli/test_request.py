@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from magnet import cli
-from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.arguments import Arguments
 from magnet.cli.errors import CommandError
 from magnet.cli.request import which_checkpoint
 from magnet.testing import tiny_tokenizer

@@ -10,7 +10,7 @@ import torch
 import magnet
 from magnet import checkpoints, cli
 from magnet.cli import request
-from magnet.cli.checkpoint_config import Arguments
+from magnet.cli.arguments import Arguments
 from magnet.denoiser.module import Denoiser
 from magnet.testing import tiny_denoiser
 from magnet.tokenizer.module import Tokenizer
