@@ -29,11 +29,7 @@ OF_FILES = (
 RECORDED = (".npz", ".bvh")
 """Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
 again."""
-IN_FPS: dict[str, Any] = {
-    "type": float,
-    "metavar": "FPS",
-    "help": "frames a second of .npz, .csv without it",
-}
+IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz, .csv without it"}
 """An option of commands that read files."""
 START: dict[str, Any] = {
     "type": int,

@@ -91,13 +91,7 @@ class DuoBoxReader(Reader):
         ("fbx_export_joints/TAKE.npy", "their skeletons, for takes without a fit"),
     )
 
-    def __init__(
-        self,
-        root: str | Path,
-        form: Form = "auto",
-        phases: int = 4,
-        validation: bool = True,
-    ) -> None:
+    def __init__(self, root: str | Path, form: Form = "auto", phases: int = 4, validation: bool = True) -> None:
         super().__init__(root)
         if form not in FILES:
             raise DataError(f"form: got {form!r}, expected 'auto', 'fit' or 'skeleton': give one of them")

@@ -328,11 +328,7 @@ def sizes(takes: Sequence[Take]) -> dict[str, int]:
 
 
 def convert_all(
-    job: PrepareJob,
-    takes: list[Take],
-    file: Callable[[Take], Path | None],
-    workers: int,
-    progress: Tell | None = None,
+    job: PrepareJob, takes: list[Take], file: Callable[[Take], Path | None], workers: int, progress: Tell | None = None
 ) -> Iterator[tuple[Take, ConvertedTake]]:
     """Make the parts of all takes as they are done, each on disk, whole, where `file` says; in any order.
 

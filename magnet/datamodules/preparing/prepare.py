@@ -12,13 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from magnet.datamodules.clip import SPLITS, Split, at_least
-from magnet.datamodules.preparing.convert import (
-    ConvertedTake,
-    PrepareJob,
-    convert_all,
-    named_errors,
-    take_key,
-)
+from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert_all, named_errors, take_key
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.recording import DataError, Reader, Take
