@@ -66,12 +66,8 @@ def _from_hyper_parameters(checkpoint: dict[str, Any]) -> Spec | None:
 def defaults(stored: Stored, given: Arguments, fit: bool, data_default: str, keep_data: bool) -> dict[str, Any]:
     """Stored options as the lowest layer of configuration.
 
-    Args:
-        stored: what the checkpoint kept.
-        given: what the user says.
-        fit: training goes on; linked options then follow from the data's by themselves.
-        data_default: class of the data where nobody names one.
-        keep_data: use the checkpoint's data where the user names none.
+    Where training goes on (`fit`), linked options follow from the data's by themselves. Where the user names no data,
+    they are the checkpoint's (`keep_data`), or those of the class `data_default`.
     """
     layer: dict[str, Any] = {}
     model_args: dict[str, Any] = {}
@@ -98,15 +94,10 @@ OWN_WAY = {"tokenizer", "start_from", "decoder_only", "optimizer", "compile", "c
 
 
 def started(name: str, given: Arguments, models: dict[str, str], data_default: str) -> dict[str, Any]:
-    """Options of the checkpoint that training starts from (`--model.start_from`), as the lowest layer.
+    """Options of the checkpoint that training starts from (`--model.start_from NAME`), as the lowest layer.
 
-    Sizes, losses and noise are those of the checkpoint, and the data have its number of people and frames.
-
-    Args:
-        name: a shipped model's, or a path.
-        given: what the user says.
-        models: modules of our models, by the class's short name.
-        data_default: class of the data where nobody names one.
+    Sizes, losses and noise are those of the checkpoint, and the data, of the class `data_default` unless the user names
+    one, have its number of people and frames. models: modules of our models, by the class's short name
 
     Raises:
         CommandError: there is no such checkpoint.

@@ -152,9 +152,7 @@ def settings(results: Results, values: SceneValues, row: str) -> dict[str, Any]:
 def single(options: Any) -> dict[str, Any]:
     """Options one by one, those of options in options as `guidance.kind`.
 
-    Args:
-        options: a mapping; or text, as Python writes objects: of a task, and in results of earlier versions of a
-            sampler too.
+    They may be text, as Python writes objects: of a task, and in results of earlier versions of a sampler, too.
     """
     return flat(options) if isinstance(options, dict) else scalars(str(options))
 

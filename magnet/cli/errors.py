@@ -102,9 +102,7 @@ KINDS = {
 def wrong_value(message: str, flag: str | None = None) -> str | None:
     """The parser's message about a value that does not fit its field, in one line; None for any other message.
 
-    Args:
-        message: jsonargparse's.
-        flag: the field as the user wrote it; by default its key.
+    flag: the field as the user wrote it; by default its key
     """
     key = re.search(r'Parser key "([\w.]+)"', message)
     got = re.search(r"(?:Got|Given) value: (.*)", message)

@@ -60,14 +60,7 @@ def newest(place: Path) -> Path | None:
 
 
 def no_run(name: str, folders: Iterable[Path], runs: Path | None, option: str = "--ckpt_path") -> str:
-    """Says that no run has a checkpoint `name`, and which checkpoints there are: there, else anywhere.
-
-    Args:
-        name: last or best.
-        folders: where it was looked for.
-        runs: where all runs lie.
-        option: that asked for it.
-    """
+    """Says that no run in `folders` has a checkpoint `name`, and which checkpoints there are: there, else in `runs`."""
     places = list(dict.fromkeys(folders))
     looked = " or ".join(map(str, places))
     there = newest_of_runs(places) or newest_of_runs([runs] if runs else [])

@@ -142,11 +142,7 @@ def _texts(value: yaml.Node) -> tuple[str, ...]:
 def with_place(layers: Sequence[str], files: Sequence[str], flags: Sequence[str], told: str) -> str:
     """The parser's sentence on a value, `--field: got V, expected ...`, with where it stands in a file or a list.
 
-    Args:
-        layers: YAML or files of it.
-        files: the user's own.
-        flags: the command line, whose value needs no place.
-        told: the sentence.
+    A value that a flag gives needs no place. layers: YAML or files of it, among which are the user's own files
     """
     match = re.match(r"--([\w.]+): got (.*?), expected ", told)
     if match is None:
@@ -170,12 +166,8 @@ def no_class(
 ) -> str:
     """Says that there is no such class, with its place where a file names it, and what may be meant.
 
-    Args:
-        files: the user's own, of YAML.
-        flags: the command line, which beats them.
-        key: what the class is: model, data or callback.
-        known: the short names that there are.
-        paths: by short name, of those that are known by a dotted path alone.
+    key: what the class is: model, data or callback
+    known: short names that there are; `paths` has the dotted paths of those that are known by no other name
     """
     given = any(value.strip("'\"") == name for _, value in valued(flags))
     found = None if given else in_files(files, "class_path", name) or in_files(files, key, name)

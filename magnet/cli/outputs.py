@@ -37,13 +37,7 @@ def show_results(results: Results, folder: Path, facts: dict[str, Any], full: bo
 
 
 def write_results(results: Results, folder: Path, facts: dict[str, Any]) -> None:
-    """Write all of a table as JSON and CSV, with how it came about, and what each scene measured (scenes.json).
-
-    Args:
-        results: of a run that is finished.
-        folder: to write to.
-        facts: more of how it came about.
-    """
+    """Write all of a table as JSON and CSV, with facts of how it came about, and each scene's numbers (scenes.json)."""
     results.meta.update(provenance() | {"machine": machine()} | facts)
     results.save_json(folder / "results.json")
     results.save_csv(folder / "results.csv")
@@ -53,12 +47,9 @@ def write_results(results: Results, folder: Path, facts: dict[str, Any]) -> None
 
 
 def print_results(results: Results, folder: Path, full: bool = False) -> None:
-    """Print a table, and where it was written.
+    """Print a table, and the folder where all of it is.
 
-    Args:
-        results: of a run that is finished.
-        folder: where all of it is.
-        full: print all that was measured, with intervals; else the main metrics, of methods as they are aligned.
+    full: all that was measured, with intervals; else the main metrics, of methods as they are aligned
     """
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)

@@ -41,16 +41,12 @@ SHOWN = 3
 def about(
     checkpoint: dict[str, Any], path: Path, trained_on: str | None, licence: str | None, decoder: Path | None = None
 ) -> dict[str, Any]:
-    """The record of a denoiser's checkpoint.
+    """The record of a denoiser's checkpoint, and of the tokenizer's whose decoder it has taken.
 
-    Args:
-        checkpoint: as it was read from `path`, with the decoder if there is one.
-        trained_on: what the user says of the data.
-        licence: what the user says of the weights.
-        decoder: a tokenizer's checkpoint whose decoder is taken.
+    trained_on, licence: what the user says of data and weights
 
     Raises:
-        CommandError: `trained_on` or `licence` is needed.
+        CommandError: one of these is needed.
     """
     own, before = origins.data_of(checkpoint), origins.started_from(checkpoint)
     if decoder is not None:

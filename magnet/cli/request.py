@@ -69,10 +69,7 @@ class Request:
 def read_request(command: str, arguments: list[str], models: dict[str, str]) -> Request:
     """Read the files and the checkpoint that a command line names, and settle who beats whom.
 
-    Args:
-        command: one of the Trainer's.
-        arguments: what follows it.
-        models: modules of our models, by the class's short name.
+    models: modules of our models, by the class's short name
 
     Raises:
         CommandError: something the user can put right.
@@ -144,13 +141,7 @@ def require_folder_name(command: str, out: str | None) -> None:
 
 
 def sampled_task(command: str, given: Arguments, fields: list[str], settled: class_options.Settled) -> TaskChoice:
-    """The task that is sampled; its options are taken out of the layers.
-
-    Args:
-        command: whose help is named in errors.
-        given: what the user says.
-        fields: flags of the task's options.
-        settled: all layers.
+    """The task that is sampled, by flags of its options (`fields`) over files; it is taken out of the layers.
 
     Raises:
         CommandError: no such task or option, or a value that does not fit.
@@ -209,11 +200,9 @@ def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Pa
 
 
 def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:
-    """`seed` as a layer, where what is said last of seeds is `seed_everything` alone, for samples follow `seed`.
+    """`seed` as a layer, where what is said last of seeds, by flags or else by files, is `seed_everything` alone.
 
-    Args:
-        files: what the user's files say, lowest first.
-        flags: the command line, which beats them.
+    Samples follow `seed`. files: lowest first
     """
     said = [{name.removeprefix("--"): value for name, value in valued(flags)}]
     said += [layer.options for layer in reversed(files)]

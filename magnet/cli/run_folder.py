@@ -99,12 +99,8 @@ def require_folder(folder: Path) -> None:
 def checkpoints(folder: Path, model: LightningModule, callbacks: Sequence[Callback] = ()) -> list[Callback]:
     """`last.ckpt` after every epoch or validation, also when training is interrupted, and `best.ckpt`.
 
-    Beside checkpoints that a user keeps, ours stay; but for best.ckpt where the user's own writes it.
-
-    Args:
-        folder: of the run.
-        model: says what is best, by `monitor` and `monitor_mode`.
-        callbacks: the user's.
+    Beside checkpoints that a user's own callbacks keep, ours stay; but for best.ckpt where one of these writes it. The
+    model says what is best, by `monitor` and `monitor_mode`.
     """
     place = folder / "checkpoints"
     last = LastCheckpoint(place, "last", save_top_k=1, save_on_exception=True, enable_version_counter=False)

@@ -17,10 +17,7 @@ LARGEST = 2**63 - 1
 
 
 def require_numbers(config: Any) -> None:
-    """Refuse numbers of the Trainer's that it takes and then fails on.
-
-    Args:
-        config: of a command, parsed.
+    """Refuse numbers of the Trainer's, in a command's parsed options, that it takes and then fails on.
 
     Raises:
         CommandError: names the option, what was got and what was expected.

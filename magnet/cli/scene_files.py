@@ -309,12 +309,8 @@ def refuse_unused(
 ) -> None:
     """Refuse an option that no file to write has a use for.
 
-    Args:
-        options: the command line.
-        flag: the option's name.
-        plain: its default, which nobody has to have said.
-        takes: suffixes of files that it changes.
-        suffixes: of the files to write.
+    plain: its default, which nobody has to have said
+    takes: suffixes of files that it changes; `suffixes` are those of the files to write
 
     Raises:
         CommandError: names the option and what it is for.

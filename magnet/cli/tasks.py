@@ -93,13 +93,9 @@ def split_flags(flags: Sequence[str]) -> tuple[list[str], list[str]]:
 def parse_task(
     name: str, flags: list[str], below: Iterable[Mapping[str, Any]] = (), command: str = "test"
 ) -> TaskChoice:
-    """A task from its flags, over the options that configuration files give it; the only way there is to read one.
+    """A task from its flags over options from files (`below`, later ones win); the only way there is to read one.
 
-    Args:
-        name: the task's.
-        flags: `--task.FIELD VALUE` or `--task.FIELD=VALUE`.
-        below: options from files, later ones win.
-        command: whose help is named in errors.
+    command: whose help is named in errors
 
     Raises:
         CommandError: no such task or option, or a value that does not fit.

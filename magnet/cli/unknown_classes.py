@@ -25,13 +25,7 @@ OTHER = r"Import path does not correspond to a (subclass of \w+)[\s\S]*Given val
 
 
 def no_such_class(message: str, files: Sequence[str], flags: Sequence[str]) -> str | None:
-    """The parser's message on a class that there is not, in one line with what may be meant; None for any other.
-
-    Args:
-        message: jsonargparse's.
-        files: the user's own, of YAML.
-        flags: the command line, which beats them.
-    """
+    """The parser's message on a class that there is not, in one line with what may be meant; None for any other."""
     key, subtypes = re.search(r'Parser key "([\w.]+)"', message), re.search(r"Subtypes: (.*)", message)
     if key is None or subtypes is None:
         return None

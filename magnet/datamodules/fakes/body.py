@@ -27,11 +27,7 @@ def write_body(path: str | Path, kind: Kind = "smplx") -> Path:
     """Write the made-up body: the open body's rest joints, each with a small octahedron about it. Returns the path.
 
     smplx: 55 joints, 20 shape columns, posedirs (V, 3, 486). smpl: 24 joints, 10 columns, posedirs (V, 3, 207). The
-    pelvis is 35 cm from the origin and moves with the shape. Always the same bytes.
-
-    Args:
-        path: an npz; folders are made.
-        kind: whose layout.
+    pelvis is 35 cm from the origin and moves with the shape. Always the same bytes. Folders of the npz are made.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -276,13 +276,8 @@ def fit_positions(
 ) -> BodyFit:
     """A body fitted to a recording's positions and to the rotations that it may know.
 
-    Args:
-        recording: whose joints and hints they are.
-        targets: (T, P, M, 3) its positions at 30 fps, y up.
-        valid: (T, P) at 30 fps.
-        body: to fit.
-        up: axis of the file's world, which hints are in.
-        progress: is told of steps done, and of how many there are.
+    targets: (T, P, M, 3) its positions at 30 fps, y up; valid: (T, P); up: axis of the file's world, which hints are in
+    progress: is told of steps done, and of how many there are
 
     Raises:
         ValueError: the body does not fit.
@@ -309,16 +304,12 @@ def fit_positions(
 
 
 def _stretches(valid: NDArray[np.bool_], cuts: list[int], flagged: list[str], least: int) -> list[tuple[int, int]]:
-    """First frames, and frames after the last, of what is left between cuts where everybody is valid.
+    """Stretches of `least` frames or more between cuts where everybody is valid: first frame, and one past the last.
 
-    Args:
-        valid: (T, P).
-        cuts: frames that begin a stretch of their own.
-        flagged: what was wrong, for messages.
-        least: frames of a stretch.
+    valid: (T, P); cuts: frames that begin a stretch of their own; flagged: what was wrong, for messages
 
     Raises:
-        DataError: nothing is left.
+        DataError: there are none.
     """
     together: NDArray[np.bool_] = np.logical_and.reduce(valid, axis=1)
     frames = len(together)

@@ -71,12 +71,9 @@ def noted(note: str, takes: list[str]) -> str:
 
 
 def check_store(folder: StoreReader, body: Body | None = None, progress: Tell | None = None) -> CheckReport:
-    """All of a store's files: checksums, then rows. What is wrong is collected, nothing raised.
+    """All of a store's files: checksums, then rows, and its body where one is given.
 
-    Args:
-        folder: the opened store.
-        body: its body, to check that it is; None: not checked.
-        progress: is told of progress, by file.
+    What is wrong is collected, nothing raised. `progress` is told of files.
     """
     manifest = folder.manifest
     found = CheckReport(manifest["name"], manifest["title"], limited="limit" in manifest)
@@ -224,14 +221,7 @@ def check_download(
     limit: int | None = None,
     progress: Tell | None = None,
 ) -> CheckReport:
-    """Every take of a download read and canonicalized; nothing is written.
-
-    Args:
-        job: which data set, where, and how.
-        workers: processes.
-        splits: as for `prepare`.
-        limit: as for `prepare`.
-        progress: is told of progress.
+    """Every take of a download read and canonicalized; nothing is written. Arguments are those of `prepare`.
 
     Raises:
         DataError: there are no takes at all.
@@ -284,15 +274,9 @@ def _first_scene(part: ConvertedTake, body: Body) -> Scene:
 
 
 def short_parts(reader: Reader, takes: Sequence[Take], least: int) -> tuple[int, list[str]]:
-    """How many of these takes are parts held out of a recording that is too short for it, and what to do.
+    """How many of some takes are parts held out of a recording that is too short for that, and what to do.
 
-    Args:
-        reader: whose takes they are.
-        takes: those that cannot be used.
-        least: frames of a clip.
-
-    Returns:
-        The number of them, and a sentence for each recording.
+    takes: that cannot be used; least: frames of a clip
     """
     if not isinstance(reader, OwnReader) or not reader.in_time:
         return 0, []

@@ -101,11 +101,7 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
 
 
 def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
-    """Valid frames without those whose numbers are no motion, and flags for the latter.
-
-    Args:
-        recording: as read.
-        valid: (T, P).
+    """Valid frames (T, P) without those whose numbers are no motion, and flags for the latter.
 
     Raises:
         DataError: nothing is left of somebody.

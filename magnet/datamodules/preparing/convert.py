@@ -69,9 +69,7 @@ def require_family(kind: type[Reader], body: Body, option: str, file: str) -> No
 def named_errors(kind: type[Reader], what: str) -> Iterator[None]:
     """Whatever a reader's code raises, or that it ends the program, as one line that names the data set.
 
-    Args:
-        kind: the reader, perhaps a stranger's.
-        what: is not possible, for errors that are no sentences.
+    what: is not possible, for errors that are no sentences
 
     Raises:
         DataError: it raised something.

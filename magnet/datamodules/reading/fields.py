@@ -98,14 +98,8 @@ def person(
 ) -> PersonMotion:
     """One person from a dict with keys of SMPL-X's family: root and 21 body joints in axis-angle, metres.
 
-    Args:
-        where: the file, for messages.
-        held: what it holds.
-        name: of the person.
-        gender: of the body that the shape is of, as the data set says it.
-        orient: the root's key.
-        body: the joints' key.
-        transl: the translation's key.
+    gender: of the body that the shape is of, as the data set says it
+    orient, body, transl: keys of the root, the joints and the translation
 
     Raises:
         DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
@@ -121,15 +115,9 @@ def person(
 def side_by_side(
     where: object, people: Sequence[PersonMotion], fps: float, up: Axis, *, cut: bool = False, notes: Iterable[str] = ()
 ) -> Recording:
-    """People who were recorded together as one recording.
+    """People who were recorded together, in the order of agents, as one recording.
 
-    Args:
-        where: the take, for messages.
-        people: in their order of agents.
-        fps: of all of them.
-        up: as the data set declares it.
-        cut: cut unequal lengths to the shortest, with a note.
-        notes: what else was found.
+    cut: unequal lengths to the shortest, with a note beside what else was found (`notes`)
 
     Raises:
         DataError: unequal lengths.

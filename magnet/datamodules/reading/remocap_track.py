@@ -99,9 +99,8 @@ def file_like(folder: Path, pattern: str, usual: str) -> Path:
 def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
     """Positions of the mapped joints in metres (T, M, 3), frame rate, and what was found.
 
-    Args:
-        folder: one person's, with motion.bvh, csv files of positions and rotations and motion_offsets.pkl.
-        scale: metres a unit.
+    folder: one person's, with motion.bvh, csv files of positions and rotations and motion_offsets.pkl
+    scale: metres a unit
 
     Raises:
         DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.

@@ -217,13 +217,9 @@ def longest_stretch(store: MemoryStore) -> int:
 
 
 def fixed_windows(store: MemoryStore, frames: int, stride: int, pad: bool = False) -> WindowIndex:
-    """Clean windows of every clip in order, `stride` apart.
+    """Clean windows of so many frames of every clip in order, `stride` frames apart.
 
-    Args:
-        store: the clips.
-        frames: window length.
-        stride: frames between the starts of windows of a clip.
-        pad: a clip shorter than the window gives one, padded; otherwise none.
+    pad: a clip shorter than the window gives one, padded; otherwise none
     """
     pairs = []
     for c in range(len(store.length)):
