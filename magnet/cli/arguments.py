@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,6 @@ from magnet.cli.errors import CommandError
 from magnet.cli.flags import class_in_flags, spec_of, taken_out
 from magnet.old_names import renamed_flags, told
 
-CONFIG_FLAGS = ("--config", "-c")
 SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
 
 
@@ -26,20 +25,14 @@ class Arguments:
     layers: list[Layer] = field(default_factory=list)
 
     @classmethod
-    def split(cls, arguments: Iterable[str]) -> Arguments:
+    def split(cls, arguments: Sequence[str]) -> Arguments:
         """Take the configuration files out, so that they go first and any flag beats any file.
 
         Raises:
             CommandError: as `read_layers`.
         """
-        found = cls([])
-        rest = iter(arguments)
-        for argument in rest:
-            name, equals, value = argument.partition("=")
-            if name in CONFIG_FLAGS:
-                found.files.append(value if equals else next(rest, ""))
-            else:
-                found.flags.append(argument)
+        named, flags = taken_out(arguments, r"(--config|-c)(=|$)")
+        found = cls(flags, [flag.partition("=")[2] + "".join(value) for flag, *value in named])
         found.layers = [layer for file in found.files for layer in read_layers(file)]
         found.flags, changed = renamed_flags(one_class(found.flags), found.class_of("model"))
         if changed:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
@@ -60,23 +62,15 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code."""
     options = parser().parse_intermixed_args(list(arguments))
-    from dataclasses import replace
-    from pathlib import Path
-
     from magnet.body.apart import APART
     from magnet.body.other_shapes import with_shapes
     from magnet.body.repair import fixed_agents, moved_apart, repaired
     from magnet.export import formats
     from magnet.export.reading import shared
-    from magnet.files import require_place
+    from magnet.files import require_place, write_text
 
     out = scene_files.path_to_write(options.out, options.inputs)
-    if not 0 <= options.slides < float("inf"):
-        raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
-    if options.shapes and (options.keep or options.poses == "keep"):
-        raise CommandError("--shapes: changes everybody's pose; leave out --keep and --poses keep")
-    if options.plot and Path(options.plot).suffix.lower() != ".svg":
-        raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
+    refuse_contradictions(options)
     if options.plot:
         require_place(options.plot)
     lend = [] if options.shapes in (None, ["exchange"]) else options.shapes
@@ -86,21 +80,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     read = [*options.inputs, *(options.shapes or ())]
     scene_files.require_unread(out, read, scene_files.slots_of(got.scene))
     formats.require_finite(got.scene, "cut such frames out")
-    if not got.scene.frames or not bool(got.scene.present.any()):
-        what = "people" if got.scene.frames else "frames"
-        raise CommandError(f"{options.inputs[0]}: holds no {what}, so there is nothing to refine")
-    if got.scene.valid is not None and not bool(got.scene.valid.any()):
-        raise CommandError(f"{options.inputs[0]}: holds no frame that is valid, so there is nothing to refine")
-    if got.scene.agents < 2 and options.poses == "keep":
-        raise CommandError(
-            f"{options.inputs[0]}: holds one person, who is in nobody's way; give several files or people, or let "
-            "poses be corrected with --poses correct"
-        )
-    wrong = [agent for agent in options.keep if not 0 <= agent < got.scene.agents]
-    if wrong:
-        raise CommandError(f"--keep {wrong[0]}: the scene has people 0 to {got.scene.agents - 1}")
-    if options.hands == "hold" and (options.apart, options.poses) != ("firm", "correct"):
-        raise CommandError("--hands hold: goes with --apart firm and --poses correct, the defaults")
+    require_somebody(options, got.scene)
     how = "hold" if options.hands == "hold" else options.apart
     before = got.scene
     if options.shapes:
@@ -115,13 +95,47 @@ def main(arguments: Sequence[str] = ()) -> int:
     show_some([f"still over 5 cm: {each}" for each in left(refined, got.body)], NAMED, ", less deep")
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:
-        from magnet.files import write_text
-
         plot = Path(options.plot)
         was, now = (curves(scene, got.body) for scene in (before, refined))
         write_text(plot, drawn(was, now, got.scene.fps))
         scene_files.say_written([plot])
     return 0
+
+
+def refuse_contradictions(options: argparse.Namespace) -> None:
+    """Refuse options that do not go together, or that cannot be.
+
+    Raises:
+        CommandError: names the first.
+    """
+    if not 0 <= options.slides < float("inf"):
+        raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
+    if options.shapes and (options.keep or options.poses == "keep"):
+        raise CommandError("--shapes: changes everybody's pose; leave out --keep and --poses keep")
+    if options.plot and Path(options.plot).suffix.lower() != ".svg":
+        raise CommandError(f"--plot {options.plot}: is drawn as .svg; give such a name")
+    if options.hands == "hold" and (options.apart, options.poses) != ("firm", "correct"):
+        raise CommandError("--hands hold: goes with --apart firm and --poses correct, the defaults")
+
+
+def require_somebody(options: argparse.Namespace, scene: Scene) -> None:
+    """Refuse a scene in which there is nothing to refine, or nobody whom --keep means.
+
+    Raises:
+        CommandError: says what is missing.
+    """
+    file = options.inputs[0]
+    if not scene.frames or not bool(scene.present.any()):
+        raise CommandError(f"{file}: holds no {'people' if scene.frames else 'frames'}, so there is nothing to refine")
+    if scene.valid is not None and not bool(scene.valid.any()):
+        raise CommandError(f"{file}: holds no frame that is valid, so there is nothing to refine")
+    if scene.agents < 2 and options.poses == "keep":
+        raise CommandError(
+            f"{file}: holds one person, who is in nobody's way; give several files or people, or let poses be "
+            "corrected with --poses correct"
+        )
+    if wrong := [agent for agent in options.keep if not 0 <= agent < scene.agents]:
+        raise CommandError(f"--keep {wrong[0]}: the scene has people 0 to {scene.agents - 1}")
 
 
 def shapes_of(options: argparse.Namespace, how: Reading, got: Read) -> Tensor:
@@ -132,8 +146,6 @@ def shapes_of(options: argparse.Namespace, how: Reading, got: Read) -> Tensor:
     Raises:
         CommandError: the file's people are too few, or its shapes are of another body.
     """
-    from dataclasses import replace
-
     from magnet.export.reading import read
 
     scene = got.scene

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +31,11 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
     said = read_layers(str(file))[-1].options
     known = inspect.signature(Trainer.__init__).parameters
     trainer = {key: value for key, value in (said.get("trainer") or {}).items() if key in known and value is not None}
+    files = [config.get("trainer") or {} for config in given.configs]
     for group in (LIMITS, ("callbacks",)):
         flags = tuple(f"--trainer.{name}" for name in group)
-        if any(flag.startswith(flags) for flag in given.flags) or _in_files(given, "trainer", group):
+        in_files = any(options.get(name) is not None for options in files for name in group)
+        if in_files or any(flag.startswith(flags) for flag in given.flags):
             trainer = {key: value for key, value in trainer.items() if key not in group}
     layer = {"trainer": trainer} | {key: said[key] for key in ("optimizer", "lr_scheduler") if said.get(key)}
     for name in class_paths(layer):
@@ -43,8 +44,3 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
                 f"{file} names {name}, which is not part of magnet: if you trust it, say --config {file}"
             )
     return layer
-
-
-def _in_files(given: Arguments, key: str, names: Iterable[str]) -> bool:
-    parts = [config.get(key) or {} for config in given.configs]
-    return any(part.get(name) is not None for part in parts for name in names)

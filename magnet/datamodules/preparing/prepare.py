@@ -15,6 +15,7 @@ from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert_all, named_errors, take_key
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.preparing.progress import Tell
+from magnet.datamodules.reading.fields import first_names
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
 from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
@@ -171,10 +172,9 @@ def summary_of(reader: Reader) -> list[str]:
         return [str(error)]
 
 
-def absent_note(names: list[str], most: int = 5) -> str:
+def absent_note(names: list[str]) -> str:
     """Says which names of the lists the download lacks; perhaps it was not unpacked completely."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{len(names)} names of the lists are not in the download: {', '.join(names[:most])}{more}"
+    return f"{len(names)} names of the lists are not in the download: {first_names(names, 5)}"
 
 
 def read_splits(path: str | Path) -> dict[str, Split]:

@@ -171,9 +171,13 @@ def _folders(root: Path, parts: Sequence[str]) -> list[Path]:
 
 def listing(folder: Path, most: int = 8) -> str:
     """What a folder holds, in a few words."""
-    names = [path.name + "/" * path.is_dir() for path in sorted(folder.iterdir())]
+    return first_names([path.name + "/" * path.is_dir() for path in sorted(folder.iterdir())], most) or "nothing"
+
+
+def first_names(names: Sequence[str], most: int) -> str:
+    """The first of many names, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return (", ".join(names[:most]) + more) or "nothing"
+    return ", ".join(names[:most]) + more
 
 
 def natural(name: str) -> tuple[tuple[str, int], ...]:
