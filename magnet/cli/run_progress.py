@@ -103,7 +103,7 @@ class SamplingProgress(ProgressBar):
         self.enabled = True
         self.bar: Progress | None = None
         self.reads: TaskID | None = None
-        self.measures: TaskID | None = None
+        self.tasks: dict[str, TaskID] = {}
         self.lines = ProgressLines()
 
     def disable(self) -> None:
@@ -113,7 +113,7 @@ class SamplingProgress(ProgressBar):
         data = trainer.datamodule  # type: ignore[attr-defined]
         plan = model.schedule(data.test.context_frames, data.test.horizon_frames)
         self.what, self.batches, self.done, self.total = what, int(batches), 0, int(batches) * plan.evaluations
-        self.measured, self.measures = 0, None
+        self.measured = 0
         model.progress, model.measuring = self._advance, self._measured
         self.lines.start()
         reads = f"{what}: reading training windows" if what == "test" and model.baselines else ""
@@ -122,34 +122,31 @@ class SamplingProgress(ProgressBar):
             self.bar = Progress(*columns)
             self.bar.start()
             self.reads = self.bar.add_task(reads, total=None) if reads else None
-            self.task = self.bar.add_task(f"{what}: denoising steps", total=self.total)
+            self.tasks = {f"{what}: denoising step": self.bar.add_task(f"{what}: denoising steps", total=self.total)}
         elif self.enabled and reads:
             self.lines.say(reads)
 
     def _advance(self, steps: int) -> None:
         self.done += steps
-        if self.bar is not None:
-            self._have_read(self.bar)
-            self.bar.advance(self.task, steps)
-        elif self.enabled:
-            self.lines.tell(f"{self.what}: denoising step", self.done, self.total)
+        self._tell(f"{self.what}: denoising step", self.done, self.total)
 
     def _measured(self, each: int) -> None:
         """each: answers and rows of a batch"""
         self.measured += 1
-        what, total = f"{self.what}: measuring", self.batches * each
-        if self.bar is not None:
-            self._have_read(self.bar)
-            if self.measures is None:
-                self.measures = self.bar.add_task(what, total=total)
-            self.bar.advance(self.measures)
-        elif self.enabled:
-            self.lines.tell(what, self.measured, total)
+        self._tell(f"{self.what}: measuring", self.measured, self.batches * each)
 
-    def _have_read(self, bar: Progress) -> None:
-        if self.reads is not None:
-            bar.update(self.reads, total=1, completed=1)
+    def _tell(self, what: str, done: int, total: int) -> None:
+        """Move the bar of what is done, or print a line if it is time."""
+        if self.bar is None:
+            if self.enabled:
+                self.lines.tell(what, done, total)
+            return
+        if self.reads is not None:  # what is read is read before anything else is done
+            self.bar.update(self.reads, total=1, completed=1)
             self.reads = None
+        if what not in self.tasks:
+            self.tasks[what] = self.bar.add_task(what, total=total)
+        self.bar.update(self.tasks[what], completed=done)
 
     def _end(self, *_: Any, **__: Any) -> None:
         if self.bar is not None:

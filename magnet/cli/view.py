@@ -17,9 +17,14 @@ from magnet.sampling.presets import PRESETS, preset_name
 if TYPE_CHECKING:
     from magnet.export.reading import Reading
 
-GENERATE = ("ckpt_path", "task", "sampler", "steps", "seed")
-ONLY_LIVE, ONLY_RECORD, NOT_LIVE = ("people",), ("frames",), ("html", "truth", "context", "samples")
-"""Options of a model that generates, of both ways to let it, of either, and those of files that are only shown."""
+GOES_WITH = {
+    **dict.fromkeys(("ckpt_path", "task", "sampler", "steps", "seed"), "--live or --record"),
+    "people": "--live",
+    "frames": "--record",
+}
+"""Options of a model that generates, and the option that lets it."""
+NOT_LIVE = ("html", "truth", "context", "samples")
+"""Options of files that are only shown."""
 STEPS = 10
 """Denoising steps where nothing is said: quick enough to watch."""
 MOST_FRAMES = 1_000_000
@@ -133,23 +138,20 @@ def _check(options: argparse.Namespace) -> None:
     if not options.files and not options.live:
         raise ValueError("nothing to watch: magnet view FILE..., or magnet view --live")
     live, record = options.live, options.record is not None
-    for names, chosen, goes_with in (
-        (GENERATE, live or record, "--live or --record"),
-        (ONLY_LIVE, live, "--live"),
-        (ONLY_RECORD, record, "--record"),
-    ):
-        if not chosen and (name := next((name for name in names if name in options.said), None)):
-            raise ValueError(f"--{name}: goes with {goes_with}; leave it out, or add that")
-    if options.live and (name := next((name for name in NOT_LIVE if name in options.said), None)):
-        raise ValueError(f"--{name} goes with files that are shown, not with --live, which generates")
-    if options.live and options.files and options.people is not None:
+    chosen = {"--live": live, "--record": record, "--live or --record": live or record}
+    for name, other in GOES_WITH.items():
+        if name in options.said and not chosen[other]:
+            raise ValueError(f"--{name}: goes with {other}; leave it out, or add that")
+    if live and (shown := [name for name in NOT_LIVE if name in options.said]):
+        raise ValueError(f"--{shown[0]} goes with files that are shown, not with --live, which generates")
+    if live and options.files and options.people is not None:
         raise ValueError("--people: --live goes on with the people of FILE; leave one of the two out")
     scene_files.require_files_to_cut(options.files, options.start, options.end)
-    if options.live and len(options.files) > 1:
+    if live and len(options.files) > 1:
         raise ValueError(f"--live goes on from one scene, got {len(options.files)} files")
-    if options.record is not None and (options.live or len(options.files) != 1):
+    if record and (live or len(options.files) != 1):
         raise ValueError("--record continues one FILE, and is not --live")
-    if options.record is not None and options.html is not None:
+    if record and options.html is not None:
         raise ValueError("--html writes what FILE holds, --record continues it: record first, then --html its OUT.npz")
     if options.frames > MOST_FRAMES:
         raise ValueError(f"--frames {options.frames}: expected 1 to {MOST_FRAMES:,}")
