@@ -138,9 +138,8 @@ def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[s
     found = {}
     for task, own in has.items():
         said = [name for name in flags if name in own]
-        fields = (
-            parse_task(task, [word for name in said for word in flags[name]], command="bench").fields if said else {}
-        )
+        words = [word for name in said for word in flags[name]]
+        fields = parse_task(task, words, command="bench").fields if said else {}
         found[task] = {name: fields[name] for name in said}
     return found
 

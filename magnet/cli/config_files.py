@@ -69,15 +69,13 @@ def read_yaml(file: str) -> dict[str, Any]:
     if not path.is_file():
         near = sorted(str(p) for p in path.parent.glob("[!.]*.yaml")) if path.parent.is_dir() else []
         close = difflib.get_close_matches(path.stem, [Path(p).stem for p in near], n=1)
-        hint = (
-            f"; did you mean {path.with_name(close[0])}.yaml?"
-            if close
-            else f"; there are {', '.join(near)}"
-            if near
-            else ""
-        )
-        if not near and path.parent.name == "configs":
-            hint = "; configs/ is in a clone of the repository: run it there, or name the file's path in it"
+        if close:
+            hint = f"; did you mean {path.with_name(close[0])}.yaml?"
+        elif near:
+            hint = f"; there are {', '.join(near)}"
+        else:
+            clone = "; configs/ is in a clone of the repository: run it there, or name the file's path in it"
+            hint = clone if path.parent.name == "configs" else ""
         raise CommandError(f"no configuration file {file or '(none named)'}{hint}")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))

@@ -53,9 +53,8 @@ def print_results(results: Results, folder: Path, full: bool = False) -> None:
     """
     title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
-    shown = (
-        results if full else replace(results, rows={m: row for m, row in results.rows.items() if m not in UNALIGNED})
-    )
+    aligned = {method: row for method, row in results.rows.items() if method not in UNALIGNED}
+    shown = results if full else replace(results, rows=aligned)
     print_table(shown, results.metrics if full else None, intervals=full, title=title, console=console)
     if "sampling" in results.meta:
         print(cost(results.meta["sampling"]))

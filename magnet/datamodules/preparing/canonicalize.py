@@ -104,10 +104,7 @@ def canonicalize(
         recording: as read, at any rate and with any up axis.
         body: whose shape numbers `betas` are; for positions: the body to fit.
         name: the take's; parts of it are called "name [start:stop]" by their frames at 30 fps.
-        source: the data set.
-        split: of the take.
-        family: of the data set.
-        options: what can be chosen.
+        source: the data set, whose `family` says what its files hold.
 
     Raises:
         DataError: NaN, units, up axis or frame rate that cannot be right, no stretch that is long enough, or

@@ -55,9 +55,8 @@ def require_family(kind: type[Reader], body: Body, option: str, file: str) -> No
     families = families_of(kind)
     if not families or body.family in ("", *families) or body.id.startswith("open"):
         return
-    other = (
-        "" if option == "--bodies" else f", or with --bodies beside this one, to have everybody as {title(body.family)}"
-    )
+    beside = f", or with --bodies beside this one, to have everybody as {title(body.family)}"
+    other = "" if option == "--bodies" else beside
     raise ValueError(
         f"{option} {file}: body {body.id!r} has the joints of {title(body.family)}, but {kind.title} holds shape "
         f"numbers of {titles(families)}: give a body file of that family with {option}{other}; such files are from "

@@ -101,9 +101,7 @@ class Recording:
     persons: tuple[str, ...] = ()  # names or roles, such as "leader", which a store keeps
     notes: tuple[str, ...] = field(default=())  # what was found where the layout leaves a doubt
     genders: tuple[Gender, ...] = ()  # (P,) of the body that each one's `betas` belong to; (): not known
-    skeletons: tuple[
-        PosedSkeleton, ...
-    ] = ()  # (P,) skeletons with rotations, which say more of a body than `positions`
+    skeletons: tuple[PosedSkeleton, ...] = ()  # (P,) with rotations, which say more of a body than `positions`
     ups: tuple[Axis, ...] = ()  # (P,) of each one's file, in place of `up`, where rotations come from different worlds
     said_fps: float | None = None  # of the files, where `fps` is another because motion was resampled on the way
 
@@ -126,12 +124,8 @@ class Recording:
                     f"{name}: got {got}, expected {want} for {T} frames of {P} people; take the file as it was "
                     "published"
                 )
-        for name, words in {
-            "persons": self.persons,
-            "genders": self.genders,
-            "skeletons": self.skeletons,
-            "ups": self.ups,
-        }.items():
+        for name in ("persons", "genders", "skeletons", "ups"):
+            words = getattr(self, name)
             if words and len(words) != P:
                 raise DataError(
                     f"{name}: got {len(words)} ({', '.join(map(str, words))}), expected one for each of {P} "
@@ -169,9 +163,7 @@ class Reader(ABC):
     family: ClassVar[Family] = "smplx"
     layout: ClassVar[tuple[tuple[str, str], ...]] = ()  # what must lie where in `root`: pattern, what it is
     shapes_of: ClassVar[tuple[str, ...]] = ()  # families of bodies that shape numbers belong to; (): `family`'s
-    fake: ClassVar[str] = (
-        ""  # module of `scenes(takes, frames, seed)` and `write_scenes(out, scenes)`, a made-up download
-    )
+    fake: ClassVar[str] = ""  # module of a made-up download: `scenes(takes, frames, seed)`, `write_scenes(out, scenes)`
     own: ClassVar[bool] = False  # recordings of a user's own, which any folder of such files may be
     version: ClassVar[int] = 1  # raise it whenever the same files would be read otherwise
 
