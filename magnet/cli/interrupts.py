@@ -29,6 +29,7 @@ TWICE = 2.0
 class EndOfStep(Callback):
     """While steps are made, lets the first SIGINT or SIGTERM end the training after the step: no batch is lost by it.
 
+    Of a step of several batches (`accumulate_grad_batches`) the rest is done, for a checkpoint holds no gradients.
     A validation that is due after the step, or runs, is finished, too: a training that goes on would not repeat it.
     Whoever says SIGTERM may not wait for it, so that a checkpoint is written first; a second SIGTERM cuts it short.
     Of several processes any may be told, each in another step: after each step they agree, and end after the same one.
@@ -40,6 +41,7 @@ class EndOfStep(Callback):
         self.since = 0.0
         self.before: dict[int, Any] = {}
         self.steps = self.said = False
+        self.step: int | None = None  # the optimizer's, before the batches that it has not seen yet
 
     @property
     def code(self) -> int:
@@ -59,9 +61,6 @@ class EndOfStep(Callback):
             if again:
                 return self._again(trainer, number, frame)
             self.since = time.monotonic()
-            if trainer.world_size == 1 and not trainer.validating:
-                self.agreed = self.asked
-                _end(trainer)
             self._say(trainer, number)
 
         for number in CODES:
@@ -99,10 +98,14 @@ class EndOfStep(Callback):
             self._say(trainer, told)
             _end(trainer)
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        self._agree(trainer)
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if self.step is None:
+            self.step = trainer.global_step
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if trainer.accumulate_grad_batches == 1 or trainer.global_step != self.step:
+            self.step = None
+            self._agree(trainer)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.steps and self.agreed:
@@ -111,7 +114,7 @@ class EndOfStep(Callback):
                 _save(trainer)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.steps:
+        if self.steps and self.step is None:
             self._agree(trainer)
 
     def _leave(self, *_: Any, **__: Any) -> None:
