@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -42,13 +42,20 @@ def warmup_cosine(
 
 
 class Rates(torch.optim.lr_scheduler.LambdaLR):
-    """Where a run goes on, its next step has the rate of this run's length, not the one the last run would have had.
+    """Where a run goes on, its next step has this run's learning rate and weight decay, and the rate of its length.
 
-    A run that had reached its end left a rate of zero, which torch changes only after a step.
+    torch would take over the last run's options, whatever is asked for now. A run that had reached its end left a rate
+    of zero, which torch changes only after a step.
     """
 
+    def __init__(self, optimizer: torch.optim.Optimizer, rate: Callable[[int], float]) -> None:
+        self.decays = [group["weight_decay"] for group in optimizer.param_groups]
+        super().__init__(optimizer, rate)
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        super().load_state_dict(state_dict)
-        for group, full, rate in zip(self.optimizer.param_groups, self.base_lrs, self.lr_lambdas, strict=True):
-            group["lr"] = full * rate(self.last_epoch)
+        own = {"base_lrs": self.base_lrs, "decays": self.decays}
+        super().load_state_dict({**state_dict, **own})
+        groups = zip(self.optimizer.param_groups, self.base_lrs, self.decays, self.lr_lambdas, strict=True)
+        for group, full, decay, rate in groups:
+            group |= {"initial_lr": full, "lr": full * rate(self.last_epoch), "weight_decay": decay}
         self._last_lr = [group["lr"] for group in self.optimizer.param_groups]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,6 +81,33 @@ def test_processes_go_by_the_clock_of_the_first() -> None:
     made["optimizer"].step()
     made["lr_scheduler"]["scheduler"].step()
     assert made["optimizer"].param_groups[0]["lr"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("muon", [0.0, 3.0])
+def test_a_run_goes_on_with_the_options_that_are_said_now(muon: float) -> None:
+    """Else a learning rate that somebody names for the rest of a run is left out without a word."""
+
+    def made(**options: float) -> tuple[torch.optim.Optimizer, Any]:
+        asked = OptimizerOptions(muon=muon, **options)  # type: ignore[arg-type]
+        both = warmup_cosine(in_training(8), nn.Linear(2, 2).parameters(), asked)
+        return both["optimizer"], both["lr_scheduler"]["scheduler"]
+
+    before, rates = made(learning_rate=1e-2, weight_decay=0.1)
+    for _ in range(2):
+        before.step()
+        rates.step()
+    other = {"learning_rate": 4e-2, "weight_decay": 0.3}
+    straight, onward = made(**other)[0], made(**other)
+    onward[0].load_state_dict(before.state_dict())
+    onward[1].load_state_dict(rates.state_dict())
+    for group, fresh in zip(onward[0].param_groups, straight.param_groups, strict=True):
+        assert (group["initial_lr"], group["weight_decay"]) == (fresh["initial_lr"], fresh["weight_decay"])
+        assert group["lr"] == pytest.approx(fresh["initial_lr"] * 0.5 * (1 + math.cos(math.pi * 2 / 8)))
+    onward[0].step()
+    onward[1].step()
+    share = 0.5 * (1 + math.cos(math.pi * 3 / 8))
+    assert [g["lr"] for g in onward[0].param_groups] == pytest.approx([share * r for r in onward[1].base_lrs])
+    assert onward[1].base_lrs == [group["initial_lr"] for group in straight.param_groups]
 
 
 def test_a_factor_below_zero_is_refused() -> None:
