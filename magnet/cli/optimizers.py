@@ -9,6 +9,7 @@ from jsonargparse import Namespace
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, instantiate_class
 from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_warn
 from torch.optim import Optimizer
 
 from magnet.cli.errors import CommandError, weights_alone
@@ -83,13 +84,18 @@ def optimizer_of(configured: Any) -> Optimizer:
 class SameOptimizer(Callback):
     """Writes into checkpoints which optimizer trained, and refuses to go on with another one, or without its state.
 
+    Fields of a chosen optimizer or scheduler are part of that state: a warning names those that were asked for in vain.
+
     Args:
         checkpoint: the file, for messages.
+        config: what the command line chose.
     """
 
-    def __init__(self, checkpoint: Any = None) -> None:
+    def __init__(self, checkpoint: Any = None, config: Namespace | None = None) -> None:
         self.checkpoint = checkpoint
+        self.config = Namespace() if config is None else config
         self.before: list[str] | None = None
+        self.told = False
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[MADE_WITH] = [type(optimizer).__name__ for optimizer in trainer.optimizers]
@@ -108,8 +114,31 @@ class SameOptimizer(Callback):
                 f"same optimizer, or begin a new run from its weights alone, with --model.start_from {self.checkpoint} "
                 "in place of --ckpt_path"
             )
+        kept = [] if self.before is None or self.told else kept_fields(self.config, trainer)
+        self.told = True
+        if kept:
+            rank_zero_warn(
+                f"the run goes on with {', '.join(kept)}, as {self.checkpoint} has it: to change that, begin a new run "
+                f"from its weights, with --model.start_from {self.checkpoint} in place of --ckpt_path"
+            )
 
     on_sanity_check_start = on_train_start
+
+
+def kept_fields(config: Namespace, trainer: Trainer) -> list[str]:
+    """Fields of a chosen optimizer and scheduler that are other than asked for, as flags with what they are."""
+    group = dict(trainer.optimizers[0].param_groups[0])
+    schedulers = [each.scheduler for each in trainer.lr_scheduler_configs]
+    rate = group.get("initial_lr", None if schedulers else group["lr"])  # of a plateau none is known
+    held = {"optimizer": group | {"lr": rate}, "lr_scheduler": vars(schedulers[0]) if schedulers else {}}
+    found = []
+    for key, state in held.items():
+        asked = plain(config[key])["init_args"] if config.get(key) else {}
+        for name in sorted((asked.keys() & state.keys()) - {"last_epoch"}):
+            now, wanted = (tuple(v) if isinstance(v, list) else v for v in (state[name], asked[name]))
+            if isinstance(now, bool | int | float | str | tuple) and now != wanted:
+                found.append(f"--{key}.{name} {now:g}" if isinstance(now, float) else f"--{key}.{name} {now}")
+    return found
 
 
 def made_with(checkpoint: dict[str, Any]) -> list[str] | None:

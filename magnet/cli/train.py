@@ -262,7 +262,8 @@ class MagnetCLI(LightningCLI):
             callbacks.append(LearningRateMonitor(logging_interval="step"))
         if fit and not config.get("fast_dev_run"):
             run_folder.require_folder(self.folder)
-            callbacks = [StepNumbers(), *callbacks, Duration(), optimizers.SameOptimizer(self.checkpoint)]
+            same = optimizers.SameOptimizer(self.checkpoint, self.config_init[self.command])
+            callbacks = [StepNumbers(), *callbacks, Duration(), same]
         if fit:
             callbacks.append(self.ctrl_c)
         if not fit and config.get("enable_checkpointing") is None:

@@ -65,6 +65,34 @@ def test_a_run_does_not_go_on_with_another_optimizer(
     assert cli.main(["fit", *more, *QUIET, "--out", "other"]) == 0
 
 
+def test_fields_of_a_chosen_optimizer_that_its_state_overrules_are_named(toy: Path) -> None:
+    step = ["--lr_scheduler", "StepLR", "--lr_scheduler.step_size", "1", "--lr_scheduler.gamma"]
+    trained("--optimizer", "AdamW", "--optimizer.lr", "0.25", *step, "0.5", "--out", "run")
+    more = ["--ckpt_path", "run/checkpoints/last.ckpt", "--trainer.max_epochs", "3", "--out", "more"]
+    other = ["--optimizer", "AdamW", "--optimizer.lr", "0.1", *step, "0.1"]
+    said = "goes on with --optimizer.lr 0.25, --lr_scheduler.gamma 0.5, as .*last.ckpt has it"
+    with pytest.warns(UserWarning, match=said) as warned:
+        assert cli.main(["fit", *more, *QUIET, *other]) == 0
+    assert sum("goes on with" in str(each.message) for each in warned) == 1
+    (group,) = ToyModel.seen["model"].trainer.optimizers[0].param_groups
+    assert group["lr"] == pytest.approx(0.25 * 0.5**3)
+
+
+def test_nothing_is_said_of_fields_that_are_as_asked_for(toy: Path, recwarn: pytest.WarningsRecorder) -> None:
+    for number, words in enumerate(
+        (
+            ["--optimizer", "AdamW", "--optimizer.lr", "0.25", "--optimizer.betas", "[0.8, 0.9]"],
+            ["--lr_scheduler", "MultiStepLR", "--lr_scheduler.milestones", "[1, 2]"],
+            ["--lr_scheduler", "ReduceLROnPlateau", "--lr_scheduler.monitor", "val/loss"],
+        )
+    ):
+        trained(*words, "--out", f"run{number}")
+        more = ["--ckpt_path", f"run{number}/checkpoints/last.ckpt", "--trainer.max_epochs", "3"]
+        for again in ([], words):
+            assert cli.main(["fit", *more, *QUIET, *again]) == 0
+    assert not [each for each in recwarn if "goes on with" in str(each.message)]
+
+
 def test_an_optimizer_is_found_in_whatever_is_configured() -> None:
     optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=0.1)
     for configured in (optimizer, [optimizer], ([optimizer], []), {"optimizer": optimizer}):
