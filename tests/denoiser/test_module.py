@@ -200,6 +200,21 @@ def test_without_a_vq_vae_the_poses_themselves_are_tokens(tmp_path):
     assert same_weights(model, Denoiser.load_from_checkpoint(tmp_path / "raw.ckpt", weights_only=True))
 
 
+def test_what_is_validated_does_not_depend_on_who_shares_a_batch(tmp_path, monkeypatch):
+    """Windows at the end of a clip are filled up, and scenes are of one person or two: means weigh by what counts."""
+
+    def losses(self: Denoiser, scene: Scene, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        counts = scene.present[:, None] & scene.valid[..., None]
+        return {"loss": scene.T_world_root[..., 1, 3][counts].mean()}
+
+    monkeypatch.setattr(Denoiser, "losses", losses)
+    model, found = build(tmp_path), []
+    for size in (1, 4, 100):
+        given = FakeData(couples_and_singles("val"), window_frames=32, max_agents=3, val_batch_size=size)
+        found.append(trainer(1, limit_val_batches=None).validate(model, given, verbose=False)[0]["val/loss"])
+    assert found == pytest.approx([found[0]] * 3, rel=1e-5)
+
+
 def test_absent_agents_cost_nothing(generator):
     model = tiny_denoiser()
     scene = random_scene(2, 32, 3, generator, present=torch.tensor([[True, True, False]] * 2))

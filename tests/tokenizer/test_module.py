@@ -14,6 +14,7 @@ from magnet.motion.tokens import scene_deltas
 from magnet.testing import random_scene, tiny_denoiser, without_absent
 from magnet.tokenizer import RawPose
 from magnet.tokenizer.features import features
+from tests.datamodules.fakes import FakeData, couples_and_singles
 
 from .small import Scenes, conditions, tiny, trainer
 
@@ -210,6 +211,19 @@ def test_training_reports_what_it_should(tmp_path: Path) -> None:
         joints, truth = tokenizer.body.joints(decoded), tokenizer.body.joints(batch)
         errors.append(float((joints - truth)[..., 1:, :].norm(dim=-1).mean()))
     assert logged["val/mpjpe_cm"] == pytest.approx(100 * sum(errors) / len(errors), rel=1e-4)
+
+
+def test_what_is_validated_does_not_depend_on_who_shares_a_batch(tmp_path: Path) -> None:
+    """Windows at the end of a clip are filled up, and scenes are of one person or two: means weigh by what counts."""
+    tokenizer = tiny(random_scene(2, 32, 2, torch.Generator().manual_seed(0)))
+    found = []
+    for size in (1, 4, 100):
+        data = FakeData(couples_and_singles("val"), window_frames=32, max_agents=2, val_batch_size=size)
+        (logged,) = trainer(tmp_path, enable_checkpointing=False).validate(tokenizer, data, verbose=False)
+        found.append(logged)
+    for logged in found[1:]:
+        for name in ("val/joint_rotation", "val/root_rotation", "val/commitment", "val/loss", "val/mpjpe_cm"):
+            assert logged[name] == pytest.approx(found[0][name], rel=1e-4), name
 
 
 # -- without a codebook ------------------------------------------------------------------------
