@@ -22,9 +22,9 @@ from magnet.motion.scene import Scene, all_valid
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
-from magnet.tokenizer.features import frames_of_people
 from magnet.training import origins
 from magnet.training.optim import warmup_cosine
+from magnet.training.validation import log_means
 
 
 class Denoiser(DenoiserCore, TokenModel):
@@ -122,7 +122,7 @@ class Denoiser(DenoiserCore, TokenModel):
         generator = torch.Generator(device=self.device).manual_seed(seed)
         losses = self.losses(batch, generator)
         logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=frames_of_people(batch), sync_dist=True, prog_bar=False)
+        log_means(self, logged, batch)
 
     def _inputs(self, scene: Scene, made: Tensor | None) -> dict[str, Tensor]:
         """What `losses` depends on in a training step, as tensors; `losses_of` takes it."""

@@ -24,9 +24,9 @@ from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive, step_generator
 from magnet.tasks.base import Task, schedule_of
 from magnet.tokenizer.base import PoseTokenizer
-from magnet.tokenizer.features import frames_of_people
 from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
+from magnet.training.validation import log_means
 
 
 class Peer(TokenModel):
@@ -130,7 +130,7 @@ class Peer(TokenModel):
         seed = derive(self.hparams["seed"], "validation", batch_idx, self.global_rank)
         losses = self.losses(batch, torch.Generator(device=self.device).manual_seed(seed))
         logged = {f"val/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=frames_of_people(batch), sync_dist=True)
+        log_means(self, logged, batch)
 
     def errors_of(self, made: Tensor, truth: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """`token_losses` of tokens of one person beside the other. made, truth (M, N, D), counts (M, N) bool"""

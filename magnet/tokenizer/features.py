@@ -45,15 +45,6 @@ def features(scene: Scene) -> Features:
     return Features(pose, deltas, scene.betas, counts, tokens, scene.valid)
 
 
-def frames_of_people(scene: Scene) -> int:
-    """How many frames of people count, at least 1: the weight of a batch whose losses are means over them.
-
-    By it losses over a whole data set do not depend on which scenes share a batch or a process.
-    """
-    valid = scene.frames if scene.valid is None else scene.valid.sum(dim=1)
-    return max(int((scene.present.sum(dim=1) * valid).sum()), 1)
-
-
 def delta_known(valid: Tensor) -> Tensor:
     """A delta is known where both of its frames are; the first one always is. (..., T) bool -> same"""
     return valid & torch.cat([valid[..., :1], valid[..., :-1]], dim=-1)

@@ -22,13 +22,14 @@ from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
 from magnet.tokenizer.base import Quantized
 from magnet.tokenizer.checkpoint import check_fields, read_checkpoint
 from magnet.tokenizer.core import TokenizerCore
-from magnet.tokenizer.features import Features, features, frames_of_people, put
+from magnet.tokenizer.features import Features, features, put
 from magnet.tokenizer.losses import JOINT_LOSSES, masked_mean, matrices, reconstruction_losses
 from magnet.tokenizer.quantizer import KMEANS_VECTORS
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_quantizer
 from magnet.training import origins
 from magnet.training.optim import warmup_cosine
+from magnet.training.validation import log_means
 
 __all__ = ["RawPose", "Tokenizer"]
 
@@ -220,7 +221,7 @@ class Tokenizer(TokenizerCore, L.LightningModule):
         self.local_mpjpe.update(100 * masked_mean(local, seen.counts), weight)
         self.code_use.update(quantized.counts)
         logged = {f"{stage}/{name}": value for name, value in losses.items()}
-        self.log_dict(logged, batch_size=frames_of_people(batch), sync_dist=True)
+        log_means(self, logged, batch)
         self.log(f"{stage}/mpjpe_cm", self.mpjpe, batch_size=batch.scenes, prog_bar=True)
         self.log(f"{stage}/mpjpe_local_cm", self.local_mpjpe, batch_size=batch.scenes)
 
