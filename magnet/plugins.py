@@ -134,8 +134,7 @@ class Registry:
         """
         found = [each for each in self.failed if each.name.lower() == name.lower()]
         if found:
-            many = len(found) > 1
-            why = "; ".join(told(each.error) + (f" (of {each.origin})" if many else "") for each in found)
+            why = "; ".join(f"{told(each.error)} (of {each.origin})" for each in found)
             raise ValueError(f"{self.what} {found[0].name} failed to load: {why}") from found[0].error
 
 

@@ -53,7 +53,7 @@ def test_one_that_fails_is_left_out_with_its_reason(
     assert set(registry.known) == {"good"} and registry.failed == [plugins.Failed("Bad", error, "of_Bad:Thing")]
     with pytest.raises(ValueError) as caught:
         registry.require_loaded("bad")
-    assert str(caught.value) == f"thing Bad failed to load: {said}"
+    assert str(caught.value) == f"thing Bad failed to load: {said} (of of_Bad:Thing)"
 
 
 def test_of_two_of_one_name_that_fail_each_is_told(offered: tuple[plugins.Registry, list[Point]]) -> None:

@@ -62,7 +62,7 @@ def draw_list(console: Console, name: str | None) -> bool:
     for entry in registry.unprepared():
         show_data(console, entry)
     for lost in registry.failures():
-        console.print(f"[bold red]{lost.name}[/]", soft_wrap=True)
+        console.print(f"[bold red]{lost.name}[/]  of {lost.origin}", soft_wrap=True, highlight=False)
         show(console, "failed to load", told(lost.error))
     return not registry.failures()
 

@@ -167,7 +167,7 @@ def draw_tasks(console: Console) -> bool:
             console.print(Padding(Text(line, style), (0, 0, 0, 4), expand=False))
         console.print()
     for lost in registry.failures():
-        console.print(Text.assemble((lost.name, "bold red"), "  failed to load"))
+        console.print(Text.assemble((lost.name, "bold red"), "  failed to load  ", (lost.origin, "dim")))
         console.print(Padding(Text(told(lost.error), "red"), (0, 0, 1, 4), expand=False))
     console.print("magnet tasks show NAME      draw in what order a task removes noise", style="dim")
     console.print("magnet test --task NAME     sample it and measure; magnet predict --task NAME", style="dim")

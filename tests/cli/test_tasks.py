@@ -100,9 +100,11 @@ def test_the_list_names_formula_origin_version_and_fields(capsys: pytest.Capture
     assert "--task.offset 1.0" in text
 
 
-def test_failures_stand_at_the_end_with_their_errors(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
+def test_failures_stand_at_the_end_with_their_packages_and_errors(
+    capsys: pytest.CaptureFixture[str], foreign: None
+) -> None:
     text = printed(capsys)
-    assert text.index("broken  failed to load") > text.index("partner_prediction")
+    assert text.index("broken  failed to load  strange-tasks 3.1") > text.index("partner_prediction")
     assert "ImportError: no module named [nowhere]" in text
 
 

@@ -103,7 +103,7 @@ def test_packages_are_listed_and_one_that_fails_hides_no_other(offered: list[Poi
     assert cli.main(["data", "list"]) == 0
     said = capsys.readouterr().out
     assert "Strolls  of theirs:Strolls" in said and "People who stroll." in said and "--data Strolls" in said
-    assert re.search(r"failed to load +ImportError: no module named shoes", said)
+    assert re.search(r"Broken  of theirs:Broken\n +failed to load +ImportError: no module named shoes", said)
     assert re.search(r"failed to load +TypeError: .*Denoiser.> is no LightningDataModule", said)
     assert "call the entry point Strolls, too" in said
     assert "cmu" in said and "DuoBox" in said
@@ -193,7 +193,7 @@ def test_a_file_may_name_it_too_also_within_a_mixture(here: Path, capsys) -> Non
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Broken", "magnet fit: error: data set Broken failed to load: ImportError: no module named shoes\n"),
+        ("Broken", "magnet fit: error: data set Broken failed to load: ImportError: no module named shoes (of theirs:"),
         ("Nowhere", "magnet fit: error: no data Nowhere; there are Synthetic, "),
     ],
 )
