@@ -6,49 +6,20 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from magnet.body import load_body
-from magnet.body.fit import clearance
 from magnet.body.joints import TOES
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_residuals import DRAGS, SWUNG, swung
 from magnet.body.settle_wishes import Wishes
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
-from magnet.motion.frames import rigid
-from magnet.motion.scene import Scene
-
-BODY = load_body()
-FPS = 30.0
-
-
-def gliding(speed: float, frames: int = 24) -> Scene:
-    """One person, upright with straight legs, who glides along z over the floor, m/s."""
-    betas = torch.zeros(1, 1, 10)
-    floor = float(clearance(BODY, betas[0])[0, 2] - BODY.rest_joints(betas[0, 0])[TOES[0], 1])
-    place = torch.zeros(1, frames, 1, 3)
-    place[..., 1] = floor
-    place[..., 2] = (torch.arange(frames) * speed / FPS)[:, None]
-    eye = torch.eye(3)
-    return Scene(
-        eye.repeat(1, frames, 1, 21, 1, 1),
-        rigid(eye.expand(1, frames, 1, 3, 3), place),
-        betas,
-        torch.ones(1, 1, dtype=torch.bool),
-    )
-
-
-def rise(scene: Scene) -> Tensor:
-    """How far toes are over where they stand. -> (B, T, P, 2) metres"""
-    above = clearance(BODY, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])[:, None, :, 2:]
-    return BODY.joints(scene)[..., TOES, 1] - above
+from tests.gliding import BODY, gliding, rise
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, 0.6, 1.0, 2.0, 4.0])
 def test_toes_are_to_be_lifted_the_more_the_faster_they_go(speed: float) -> None:
-    lift = swung(BODY.joints(gliding(speed)), FPS)
+    lift = swung(BODY.joints(gliding(speed)), 30.0)
     assert lift.shape == (1, 24, 1, 2)
-    faster = swung(BODY.joints(gliding(speed + 0.2)), FPS)
+    faster = swung(BODY.joints(gliding(speed + 0.2)), 30.0)
     least, most = (0.0, 1e-5) if speed <= DRAGS else (0.002, SWUNG)
     assert least <= float(lift.min()) and float(lift.max()) < most
     assert bool((faster > lift - 1e-5).all())
@@ -58,13 +29,13 @@ def test_the_slower_of_two_steps_counts_also_that_from_the_frame_before() -> Non
     """A foot that has just come to stand, or is about to leave, stays down."""
     joints = BODY.joints(gliding(2.0))
     stopped = torch.cat([joints[:, :12], joints[:, 11:12].expand(-1, 12, -1, -1, -1)], dim=1)
-    lift = swung(stopped, FPS)
+    lift = swung(stopped, 30.0)
     assert bool((lift[:, :11] > 0.02).all()) and float(lift[:, 12:].max()) == 0
-    whole, begun = swung(stopped, FPS)[:, 1:], swung(stopped[:, 1:], FPS, stopped[:, :1])
+    whole, begun = swung(stopped, 30.0)[:, 1:], swung(stopped[:, 1:], 30.0, stopped[:, :1])
     assert torch.allclose(whole, begun)
-    still = swung(joints[:, 1:], FPS, joints[:, 1:2])
+    still = swung(joints[:, 1:], 30.0, joints[:, 1:2])
     assert bool((still[:, 0] == 0).all()) and bool((still[:, 1:] > 0.02).all())
-    assert bool((swung(joints[:, :1], FPS) == 0).all())
+    assert bool((swung(joints[:, :1], 30.0) == 0).all())
 
 
 def test_toes_that_drag_are_lifted_and_toes_that_stand_are_not() -> None:
@@ -72,7 +43,7 @@ def test_toes_that_drag_are_lifted_and_toes_that_stand_are_not() -> None:
         scene = gliding(speed)
         assert float(rise(scene).abs().max()) < 1e-4
         offset = correction(scene, BODY, Wishes.of(scene, BODY), settle=Settle(swing=4.0, lift=10.0))
-        lifted = rise(corrected(scene, offset))[:, 4:-4]
+        lifted = rise(corrected(scene, offset))[4:-4]
         assert least < float(lifted.min()) and float(lifted.max()) < most, speed
 
 
@@ -89,7 +60,7 @@ def test_most_recorded_toes_are_lifted_so_far_at_each_speed(cmu_root: Path, take
     names, ends = read.skeleton.names, torch.from_numpy(read.world()[1][::2]).float()
     joints = ends.new_zeros(1, len(ends), 1, 22, 3)
     joints[0, :, 0, TOES] = ends[:, [names.index(foot) for foot in ("lfoot", "rfoot")]]
-    lift, height = swung(joints, FPS), joints[..., TOES, 1]
+    lift, height = swung(joints, 30.0), joints[..., TOES, 1]
     lifted = height - height[lift == 0].median()
     for least, most in ((0.015, 0.025), (0.025, SWUNG)):
         at = (lift > least) & (lift <= most)
