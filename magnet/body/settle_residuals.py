@@ -125,7 +125,7 @@ def lifted(value: Tensor, weight: Tensor, seen: Seen, goals: Goals) -> tuple[Ten
     lift = swung(seen.by_frame, goals.fps, goals.before)[goals.own]  # (nodes that are free, 2)
     lift = torch.cat([torch.zeros_like(lift), lift], dim=1).flatten()  # ankles, toes
     floor = len(value) - len(lift)
-    more = torch.where(lift > 0, goals.swing**0.5, 1.0)
+    more = 1 + (goals.swing**0.5 - 1) * (lift > 0).to(lift)
     return torch.cat([value[:floor], value[floor:] + lift]), torch.cat([weight[:floor], weight[floor:] * more])
 
 
