@@ -163,3 +163,8 @@ def test_few_frames_before_people_are_refused_where_shapes_or_genders_say_how_ma
         rotations("file", {"poses": poses} | told)
     square = np.stack([vectors(72)[:2]] * 2)
     assert rotations("file", {"poses": square} | told).shape == (2, 2, 72)
+
+
+def test_shape_numbers_of_each_frame_of_one_person_are_not_taken_for_people() -> None:
+    poses = np.stack([vectors(72)[:12]])
+    assert rotations("file", {"poses": poses, "betas": np.zeros((12, 10))}).shape == (1, 12, 72)
