@@ -111,7 +111,8 @@ def _rate(path: Path, table: JointTable, said: float | None) -> tuple[float, lis
         return FPS, [*notes, f"  it has one frame and so no rate: {FPS:g} frames a second, unless --in_fps says others"]
     if rate is None:
         why = f"{table.told}, and it " if table.told else ""
-        raise ValueError(f"{path}: {why}says no time; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
+        lacks = "says no time" if table.second is None else "its times tell no rate, as where they hardly change"
+        raise ValueError(f"{path}: {why}{lacks}; say its frames a second: --in_fps 30 (in_fps=30 in Python)")
     if table.step > 1:
         notes.append(f"  its frames are counted in steps of {table.step}, so {rate:g} of them are a second")
     return rate, notes

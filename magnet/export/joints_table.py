@@ -30,6 +30,8 @@ FRAME, TIME = ("frame", "frame_id", "frame_index"), ("time_s", "time", "seconds"
 PERSON = ("person", "person_id", "id", "track", "track_id", "subject", "actor", "skeleton")
 SLOWEST = 1.0
 """Seconds from a frame to the next at most."""
+COARSE = 3.0
+"""Frames of each time, on average, from which times say a rate only by when they change, as whole seconds do."""
 SLOW, FAST = 10.0, 1000.0
 """Frames a second of no tracker's, below and above."""
 PARTS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e7: "ticks of 100 ns", 1e9: "nanoseconds"}
@@ -290,8 +292,12 @@ def _rate(seconds: Floats, frame: NDArray[np.int64], told: Sequence[str]) -> flo
     good, whose = np.isfinite(seconds), np.array(told)
     found: list[tuple[float, float]] = []
     for person in dict.fromkeys(told):
-        mine = good & (whose == person)
-        if mine.any() and np.ptp(seconds[mine]) > 0 and np.ptp(frame[mine]) > 0:
+        mine = np.flatnonzero(good & (whose == person))
+        mine = mine[np.argsort(frame[mine], kind="stable")]
+        times, first = np.unique(seconds[mine], return_index=True)
+        if len(mine) >= COARSE * len(times):  # a first time may have begun before its first row
+            mine = mine[first[1:]]
+        if len(mine) and np.ptp(seconds[mine]) > 0 and np.ptp(frame[mine]) > 0:
             found.append((float(np.ptp(seconds[mine])), float(np.ptp(frame[mine]))))
     if not found:
         return None

@@ -19,8 +19,9 @@ APART = 0.7
 """Share of a frame from one person's row to another's, at most, where each has a clock of their own."""
 SHUFFLED = 3.0
 """Rows that go forward in time, on average, before one goes back: two in shuffled ones, many in two recordings."""
-OVERLAP = 2.0
-"""Steps that two stretches of rows may have of the same time, where rows came a little late."""
+OVERLAP = 2
+"""Rows of each of two stretches that may be of the other's moments, and steps that times may go back where frames go
+on, where rows came late."""
 DRIFT, DRIFTS = 1.5, 0.1
 """Frames and seconds, whichever is more, that a row counted as a frame may be from its time."""
 REGULAR, SAME, COUNTED = 0.9, 0.2, 10
@@ -53,16 +54,18 @@ def require_one_recording(path: Path, values: Floats, told: Sequence[str], lines
         if len(ends) == 1 or len(own) / len(ends) < SHUFFLED or not (forward > 0).any():
             continue
         begins = np.concatenate([[0], ends[:-1] + 1])
-        usual, seen = float(np.median(forward[forward > 0])), -np.inf
-        for k in np.argsort(own[begins], kind="stable").tolist():
-            if seen - own[begins[k]] > OVERLAP * usual or (seen == own[ends[k]] and begins[k] < ends[k]):
+        last, *others = np.argsort(own[begins], kind="stable").tolist()  # the stretch that has gone on for longest
+        for k in others:
+            before, after = own[begins[last] : ends[last] + 1], own[begins[k] : ends[k] + 1]
+            shared = min(len(before) - np.searchsorted(before, after[0], "right"), np.searchsorted(after, before[-1]))
+            if shared > OVERLAP or (before[-1] == after[-1] and begins[k] < ends[k]):
                 row = max(begins[k], begins[begins > 0].min())
                 who = "two recordings" if told[rows[0]] else "two recordings, or of two people without a column person"
                 raise ValueError(
                     f"{path}, line {lines[rows[row]]}: {what} go back from {own[row - 1]:.6g} to {own[row]:.6g} and "
                     f"through the same moments again{_whose(told, rows)}, as of {who}: save each in a file of its own"
                 )
-            seen = max(seen, own[ends[k]])
+            last = k if after[-1] > before[-1] else last
 
 
 def require_times_with_frames(

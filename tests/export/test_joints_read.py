@@ -115,6 +115,13 @@ def test_a_table_without_a_time_asks_for_the_rate_and_a_file_a_person_is_one_sce
     assert got.fps == 60 and off(got, salsa, body) < 0.02
 
 
+def test_whole_seconds_that_change_once_tell_no_rate(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time_s,left_hip_x,left_hip_y,left_hip_z\n" + "".join(f"{t // 30},{t},1,2\n" for t in range(50)))
+    with pytest.raises(ValueError, match="its times tell no rate, as where they hardly change; say its frames a sec"):
+        read(path)
+
+
 @pytest.mark.parametrize("without", ["time", ""])
 def test_one_frame_needs_no_rate(without: str, salsa: Scene, body: Body, tmp_path: Path) -> None:
     path = tracked(salsa.slice(8, 9), body, tmp_path / "a.csv")

@@ -149,3 +149,22 @@ def test_rows_of_nobody_that_jump_between_two_places_are_two_people(tmp_path: Pa
         read(tmp_path, ONE, rows)
     found = read(tmp_path, ONE, [f"{k // 2},{k / 90:.4f},0,0" for k in range(120)])  # one who goes on
     assert len(found.at) == 120
+
+
+@pytest.mark.parametrize("row", [9, 20, 50])
+@pytest.mark.parametrize("late", [2, 3, 8, -8])
+def test_a_row_that_comes_late_or_early_is_no_second_recording(row: int, late: int, tmp_path: Path) -> None:
+    times = [time for k, time in enumerate(CLOCK) if k != row]
+    times.insert(row + late, CLOCK[row])
+    found = read(tmp_path, ONE, alone(times))
+    assert found.fps == 30.0 and found.at[:, 0, 0, 0].round(3).tolist() == [round(time + 1, 3) for time in CLOCK]
+
+
+@pytest.mark.parametrize("fps", [5.0, 15.0, 30.0, 60.0])
+@pytest.mark.parametrize("begin", [0.0, 0.3, 0.9])
+def test_times_in_whole_seconds_say_the_rate_by_when_they_change(fps: float, begin: float, tmp_path: Path) -> None:
+    """The first and the last second are not whole."""
+    times = [int(begin + 1e-6 + t / fps) for t in range(int(4.5 * fps))]
+    rows = [f"{time},{t},0,0" for t, time in enumerate(times)]
+    assert read(tmp_path, ONE, rows).fps == pytest.approx(fps)
+    assert read(tmp_path, TWO, [f"{name},{row}" for name in "AB" for row in rows]).fps == pytest.approx(fps)
