@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MethodType
 from typing import Any
 
@@ -21,6 +22,8 @@ KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
 
 MADE_WITH = "magnet_optimizer"
 """Key of a checkpoint: the class of its optimizer, whose state torch would give to any other."""
+FIELDS = "magnet_optimizer_fields"
+"""Key of a checkpoint: what its run was asked to train with. States do not tell, for schedulers change them."""
 
 
 def add_optimizer_arguments(parser: LightningArgumentParser) -> None:
@@ -93,17 +96,20 @@ class SameOptimizer(Callback):
 
     def __init__(self, checkpoint: Any = None, config: Namespace | None = None) -> None:
         self.checkpoint = checkpoint
-        self.config = Namespace() if config is None else config
+        self.asked = fields_of(Namespace() if config is None else config)
+        self.fields = self.asked  # of the first run, whose state goes on
         self.before: list[str] | None = None
         self.told = False
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[MADE_WITH] = [type(optimizer).__name__ for optimizer in trainer.optimizers]
+        checkpoint[FIELDS] = self.fields
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if not checkpoint.get("optimizer_states") and trainer.state.fn == TrainerFn.FITTING:
             raise CommandError(weights_alone(self.checkpoint))
         self.before = made_with(checkpoint)
+        self.fields = {**self.asked, **checkpoint.get(FIELDS, {})}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         now = [type(optimizer).__name__ for optimizer in trainer.optimizers]
@@ -114,7 +120,7 @@ class SameOptimizer(Callback):
                 f"same optimizer, or begin a new run from its weights alone, with --model.start_from {self.checkpoint} "
                 "in place of --ckpt_path"
             )
-        kept = [] if self.before is None or self.told else kept_fields(self.config, trainer)
+        kept = [] if self.before is None or self.told else kept_fields(self.asked, self.fields)
         self.told = True
         if kept:
             rank_zero_warn(
@@ -125,18 +131,23 @@ class SameOptimizer(Callback):
     on_sanity_check_start = on_train_start
 
 
-def kept_fields(config: Namespace, trainer: Trainer) -> list[str]:
-    """Fields of a chosen optimizer and scheduler that are other than asked for, as flags with what they are."""
-    group = dict(trainer.optimizers[0].param_groups[0])
-    schedulers = [each.scheduler for each in trainer.lr_scheduler_configs]
-    rate = group.get("initial_lr", None if schedulers else group["lr"])  # of a plateau none is known
-    held = {"optimizer": group | {"lr": rate}, "lr_scheduler": vars(schedulers[0]) if schedulers else {}}
+def fields_of(config: Namespace) -> dict[str, dict[str, Any]]:
+    """Numbers, words and lists of them that a chosen optimizer and scheduler are made with, by option and name."""
+    found: dict[str, dict[str, Any]] = {}
+    for key in KEYS:
+        if config.get(key):
+            said = {name: list(v) if isinstance(v, tuple) else v for name, v in plain(config[key])["init_args"].items()}
+            found[key] = {name: v for name, v in said.items() if isinstance(v, bool | int | float | str | list)}
+    return found
+
+
+def kept_fields(asked: Mapping[str, Mapping[str, Any]], kept: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Fields (`fields_of`) that are other than asked for, as flags with what they are."""
     found = []
-    for key, state in held.items():
-        asked = plain(config[key])["init_args"] if config.get(key) else {}
-        for name in sorted((asked.keys() & state.keys()) - {"last_epoch"}):
-            now, wanted = (tuple(v) if isinstance(v, list) else v for v in (state[name], asked[name]))
-            if isinstance(now, bool | int | float | str | tuple) and now != wanted:
+    for key, fields in asked.items():
+        for name in sorted((fields.keys() & kept[key].keys()) - {"last_epoch"}):
+            now = kept[key][name]
+            if now != fields[name]:
                 found.append(f"--{key}.{name} {now:g}" if isinstance(now, float) else f"--{key}.{name} {now}")
     return found
 

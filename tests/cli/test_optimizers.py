@@ -15,6 +15,8 @@ from tests.toys import ToyModel
 
 QUIET = ["--trainer.enable_progress_bar", "false", "--trainer.logger", "false", "--trainer.accelerator", "cpu"]
 
+SGD = ["--optimizer", "SGD", "--optimizer.lr", "0.25", "--optimizer.momentum", "0.5"]
+
 
 def trained(*words: str) -> Any:
     """The trainer after two epochs."""
@@ -84,6 +86,8 @@ def test_nothing_is_said_of_fields_that_are_as_asked_for(toy: Path, recwarn: pyt
             ["--optimizer", "AdamW", "--optimizer.lr", "0.25", "--optimizer.betas", "[0.8, 0.9]"],
             ["--lr_scheduler", "MultiStepLR", "--lr_scheduler.milestones", "[1, 2]"],
             ["--lr_scheduler", "ReduceLROnPlateau", "--lr_scheduler.monitor", "val/loss"],
+            [*SGD, "--lr_scheduler", "OneCycleLR", "--lr_scheduler.max_lr", "0.5", "--lr_scheduler.total_steps", "9"],
+            [*SGD, "--lr_scheduler", "CyclicLR", "--lr_scheduler.max_lr", "0.5", "--lr_scheduler.base_lr", "0.01"],
         )
     ):
         trained(*words, "--out", f"run{number}")
