@@ -23,7 +23,6 @@ NEAR = 0.03
 BODY_REACH = 1.6
 """Metres between pelvises beyond which bodies cannot touch, even with arms half stretched out."""
 
-
 SWUNG, DRAGS, QUICKENS = 0.03, 0.3, 0.6
 """Metres over where it stands that a toe is swung at high speed; m/s up to which it may stay down, and over which it
 comes near that height (`swung`)."""

@@ -31,10 +31,7 @@ FINISHED = Settle(iterations=8, inner=24, bend=100.0, root=10.0, swing=4.0, hold
 """How a finished chunk is corrected: so loosely that bodies which pass in two frames come apart too, and by limbs
 rather than by moving people about (docs/experiments_corrections.md)."""
 
-ANEW = (
-    replace(STUBBORN, swing=4.0),
-    replace(STUBBORN, swing=4.0, root=0.3, hold=0.3, hard=200.0),
-)
+ANEW = (replace(STUBBORN, swing=4.0), replace(STUBBORN, swing=4.0, root=0.3, hold=0.3, hard=200.0))
 """How it is corrected, one after the other, while somebody stays over `TOO_DEEP` in another: smoothly, for who is
 thrown out of another within two frames is seen more than some centimetres of depth. The second moves whole people
 aside, and hands give way (docs/experiments_corrections.md, "Nobody is thrown")."""

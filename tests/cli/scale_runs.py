@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -25,6 +24,7 @@ from magnet.datamodules import synthetic  # noqa: F401
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
 from magnet.motion.tokens import TokenLayout
+from tests.processes import as_by_torchrun, free_port
 
 ROOT = Path(__file__).parents[2]
 FIT = ("fit", "--config", str(ROOT / "configs" / "debug.yaml"), "--trainer.log_every_n_steps", "1")
@@ -52,9 +52,7 @@ def cut(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
 
 def begun(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
     """Processes that run one command together, each with the variables that torchrun would give it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     every = [*words, "--out", str(out)]
     context = multiprocessing.get_context("fork")
     each = [context.Process(target=process, args=(r, world, port, every, f"{out}.{r}.log")) for r in range(world)]
@@ -65,10 +63,7 @@ def begun(world: int, out: Path, *words: str) -> list[multiprocessing.Process]:
 
 def process(rank: int, world: int, port: int, words: list[str], log: str) -> None:
     """One process of a training, its words in a file."""
-    torch.set_num_threads(1)
-    told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": world, "LOCAL_WORLD_SIZE": world, "GROUP_RANK": 0}
-    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "TORCHELASTIC_RUN_ID": "test"}
-    os.environ.update({name: str(value) for name, value in {**told, **place}.items()})
+    as_by_torchrun(rank, world, port)
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(file, 1)
     os.dup2(file, 2)

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
 from pathlib import Path
 
 import lightning as L
 import pytest
-import torch
 import torch.multiprocessing as mp
 
 from magnet.evaluation.evaluator import MODEL
 from tests.evaluation.test_evaluator import data, prepared, run
+from tests.processes import as_by_torchrun, free_port
 
 
 def one_of_two(rank: int, port: int, folder: str) -> None:
-    """One process of a test run, with the variables that torchrun would give it."""
-    torch.set_num_threads(1)
-    told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 2, "LOCAL_WORLD_SIZE": 2, "GROUP_RANK": 0}
-    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "TORCHELASTIC_RUN_ID": "test"}
-    os.environ.update({name: str(value) for name, value in {**told, **place}.items()})
+    """One process of a test run."""
+    as_by_torchrun(rank, 2, port)
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
     trainer = L.Trainer(accelerator="cpu", devices=2, strategy="ddp", **quiet)
     evaluation, _ = prepared(baselines=False)
@@ -34,9 +29,7 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
 @pytest.mark.slow
 def test_two_processes_tell_of_the_scenes_of_both(tmp_path: Path) -> None:
     """Nine scenes, of which one process has five."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     mp.spawn(one_of_two, args=(port, str(tmp_path)), nprocs=2)
     one = run(data(), baselines=False).results
     for rank in range(2):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import socket
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from lightning.pytorch import LightningModule, Trainer
 from magnet.motion.scene import Scene
 from magnet.training.validation import frames_of_people, log_means
 from tests.datamodules.fakes import FakeData, couples_and_singles, random_clip
+from tests.processes import as_by_torchrun, free_port
 
 
 class Heights(LightningModule):
@@ -39,11 +38,8 @@ def validated(size: int, **where: Any) -> float:
 
 
 def one_of_three(rank: int, port: int, folder: str) -> None:
-    """One process of a validation, with the variables that torchrun would give it."""
-    torch.set_num_threads(1)
-    told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": 3, "LOCAL_WORLD_SIZE": 3, "GROUP_RANK": 0}
-    place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "TORCHELASTIC_RUN_ID": "test"}
-    os.environ.update({name: str(value) for name, value in {**told, **place}.items()})
+    """One process of a validation."""
+    as_by_torchrun(rank, 3, port)
     torch.save(validated(4, devices=3, strategy="ddp"), Path(folder, f"{rank}.pt"))
 
 
@@ -54,9 +50,7 @@ def test_who_shares_a_batch_makes_no_difference() -> None:
 @pytest.mark.slow
 def test_who_shares_a_process_makes_no_difference(tmp_path: Path) -> None:
     """Three do not divide the 1,268 frames of people evenly."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     mp.spawn(one_of_three, args=(port, str(tmp_path)), nprocs=3)
     found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(3)]
     assert found == pytest.approx([validated(1)] * 3, rel=1e-5)
