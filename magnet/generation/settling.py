@@ -331,7 +331,7 @@ def settled_on(
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
         changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
         whole[:, :, who[number]] = changes[:, :, number]
-        if bool(sees[:, number].any()):
+        if bool((sees[:, number] & moving).any()):  # else nobody asks how it was corrected
             done = corrected(shaped, changes * one[:, None])
             shaped = shaped.replace(body_rot=done.body_rot, T_world_root=done.T_world_root)
     made = corrected(scene, whole)
