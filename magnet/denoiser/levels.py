@@ -10,6 +10,7 @@ from torch import Tensor
 
 from magnet.denoiser.options import NoiseOptions
 from magnet.sampling.noise import LEVELS, shifted
+from magnet.seeding import derive
 
 PER_TOKEN, PER_TIMESTEP, PER_SEQUENCE, ROLLOUT = range(4)
 MIXTURE = (0.2, 0.1, 0.65)
@@ -45,6 +46,24 @@ strides of twelve, as `duet` goes, they show seven."""
 
 FAINT = 300
 """Highest level at which a past is shown faintly."""
+
+
+def drawn(
+    noise: NoiseOptions, shape: torch.Size, generator: torch.Generator, present: Tensor, places: Sequence[int] = ()
+) -> tuple[Tensor, Tensor]:
+    """Levels (B, N, P) int and normal noise (B, N, P, D) of a batch whose tokens are of `shape`.
+
+    With places, one of each scene, a scene's are those of its place, whoever shares the batch; else of `draw_levels`.
+    """
+    if not places:
+        B, N, P, _ = shape
+        levels = draw_levels(noise, B, N, P, generator, present)
+        return levels, torch.randn(shape, generator=generator, device=generator.device)
+    found = []
+    for b, place in enumerate(places):
+        own = torch.Generator(generator.device).manual_seed(derive(generator.initial_seed(), place))
+        found.append(drawn(noise, torch.Size((1, *shape[1:])), own, present[b : b + 1]))
+    return torch.cat([levels for levels, _ in found]), torch.cat([normal for _, normal in found])
 
 
 def draw_levels(

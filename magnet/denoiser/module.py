@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from magnet.cuda_graphs import GraphedStep
 from magnet.denoiser import starting
 from magnet.denoiser.body_losses import BODY_LOSSES, decoded_losses
 from magnet.denoiser.core import DenoiserCore
-from magnet.denoiser.levels import FAINT, draw_levels
+from magnet.denoiser.levels import FAINT, drawn
 from magnet.denoiser.losses import consistency_losses, near_loss, shake_loss, snr_weights, token_losses
 from magnet.denoiser.self_forcing import MadePasts, displaced_at_first, with_made_pasts, with_self_forcing
 from magnet.denoiser.statistics import token_statistics
@@ -35,6 +36,8 @@ class Denoiser(DenoiserCore, TokenModel):
 
     made_pasts: MadePasts | None = None  # set by `magnet.callbacks.RollOuts`
     graphed: GraphedStep | None = None  # of the training that is going on
+    validated = 0  # scenes of this process in the validation that is going on
+    places: Sequence[int] = ()  # of a validation's batch: which scenes of the whole validation set they are
 
     # -- training ------------------------------------------------------------------------------
 
@@ -116,11 +119,19 @@ class Denoiser(DenoiserCore, TokenModel):
         self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
         return losses["loss"]
 
+    def on_validation_epoch_start(self) -> None:
+        self.validated = 0
+
     def validation_step(self, batch: Scene, batch_idx: int) -> None:
-        # The same noise at every validation, so that epochs can be compared.
-        seed = derive(self.hparams["seed"], "validation", batch_idx, self.global_rank)
-        generator = torch.Generator(device=self.device).manual_seed(seed)
-        losses = self.losses(batch, generator)
+        # The same noise at every validation, in whatever batches and processes: epochs and runs can be compared.
+        generator = torch.Generator(device=self.device).manual_seed(derive(self.hparams["seed"], "validation"))
+        world, first = self.trainer.world_size, self.validated
+        self.places = [(first + b) * world + self.global_rank for b in range(batch.scenes)]
+        self.validated += batch.scenes
+        try:
+            losses = self.losses(batch, generator)
+        finally:
+            self.places = ()
         logged = {f"val/{name}": value for name, value in losses.items()}
         log_means(self, logged, batch)
 
@@ -160,12 +171,10 @@ class Denoiser(DenoiserCore, TokenModel):
             named = scene.pad_agents(layout.agents)
             scene = named.replace(names=())  # by which a GPU would be waited for
             truth = self.normalizer.normalize(tokens)
-            B, N, P, _ = truth.shape
-            levels = draw_levels(self.noise, B, N, P, generator, scene.present)
+            levels, noise = drawn(self.noise, truth.shape, generator, scene.present, self.places)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)
-            noise = torch.randn(truth.shape, generator=generator, device=truth.device)
             cond = self.shown_condition(named, generator)
             shown = self._self_forced(truth, levels, scene, cond, generator)
             noisy = add_noise(shown, noise, layout.spread(group_levels))

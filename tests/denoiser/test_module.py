@@ -1,13 +1,17 @@
+from pathlib import Path
+
 import lightning as L
 import pytest
 import torch
+import torch.multiprocessing as mp
 
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene, tiny_denoiser, tiny_tokenizer
 from tests.cases import few
-from tests.datamodules.fakes import FakeData, couples_and_singles
+from tests.datamodules.fakes import FakeData, couples_and_singles, random_clip
+from tests.processes import as_by_torchrun, free_port
 
 SIZES = {"network": {"width": 32, "layers": 1, "heads": 2, "mlp_ratio": 2, "level_width": 16}}
 
@@ -213,6 +217,29 @@ def test_what_is_validated_does_not_depend_on_who_shares_a_batch(tmp_path, monke
         given = FakeData(couples_and_singles("val"), window_frames=32, max_agents=3, val_batch_size=size)
         found.append(trainer(1, limit_val_batches=None).validate(model, given, verbose=False)[0]["val/loss"])
     assert found == pytest.approx([found[0]] * 3, rel=1e-5)
+
+
+def validated(size: int, **where) -> float:
+    """The loss over windows of couples, in batches of `size`."""
+    clips = [random_clip(f"couple{i}", 100, split="val") for i in range(3)]
+    given = FakeData(clips, window_frames=32, max_agents=2, val_batch_size=size)
+    model = tiny_denoiser(window=8)
+    return trainer(1, limit_val_batches=None, **where).validate(model, given, verbose=False)[0]["val/loss"]
+
+
+def one_of_two(rank: int, port: int, folder: str) -> None:
+    as_by_torchrun(rank, 2, port)
+    torch.save(validated(2, devices=2, strategy="ddp"), Path(folder, f"{rank}.pt"))
+
+
+def test_a_scene_is_validated_with_the_same_noise_in_any_batch():
+    assert [validated(size) for size in (2, 5, 100)] == pytest.approx([validated(1)] * 3, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_scene_is_validated_with_the_same_noise_in_any_process(tmp_path):
+    mp.spawn(one_of_two, args=(free_port(), str(tmp_path)), nprocs=2)
+    assert [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)] == pytest.approx([validated(3)] * 2, rel=1e-5)
 
 
 def test_absent_agents_cost_nothing(generator):
