@@ -119,7 +119,7 @@ def resolve(name_or_path: str | Path | None = None) -> Path:
 
 
 def read(path: str | Path, halves: bool = False) -> dict[str, Any]:
-    """A checkpoint in Lightning's form, from a released folder or one of Lightning's files, of any version.
+    """A checkpoint in Lightning's form, from a released folder or one of Lightning's files.
 
     With `halves`, weights that were released in float16 stay so, for a caller who copies them into a model at once.
     Converting them here would take as much memory again as the model, and not all of it would be freed.
@@ -139,12 +139,13 @@ def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]
         ValueError: not a checkpoint, or of a later format.
     """
     if path.is_dir():
-        return renamed_checkpoint(_read_folder(path, halves))
+        return _read_folder(path, halves)
     if path.suffix.lower() in MOTION and path.is_file():
         raise ValueError(f"{path}: is a file of motion, expected a checkpoint, such as last.ckpt, or a model's name")
     try:
         mapped = mmap and zipfile.is_zipfile(path)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+        checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+        return checkpoint
     except FileNotFoundError:
         raise
     except pickle.UnpicklingError as error:  # whose text is a screen of advice to read the file all the same
@@ -156,7 +157,6 @@ def load(path: Path, mmap: bool = False, halves: bool = False) -> dict[str, Any]
         raise ValueError(
             f"{path}: not a checkpoint that can be read safely ({type(error).__name__}: {error})"
         ) from error
-    return renamed_checkpoint(checkpoint) if isinstance(checkpoint, dict) else checkpoint
 
 
 def contents(checkpoint: Any) -> str:
@@ -191,7 +191,7 @@ def checksum_file(path: Path) -> Path:
 def verify(path: Path) -> None:
     """Check that a checkpoint's bytes are those that were written.
 
-    The checksum beside it decides. A checkpoint without one, of an older version or another program, is checked by the
+    The checksum beside it decides. A checkpoint without one, copied alone or of another program, is checked by the
     CRC-32 of each record in its archive.
 
     Raises:
@@ -269,7 +269,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
             raise ValueError(f"{file} is damaged: its hash is not the one in config.json: fetch the release again")
         for name, value in load_file(file).items():
             state[name] = value if halves or value.dtype != torch.float16 else value.float()
-    return {
+    checkpoint = {
         "state_dict": state,
         "pytorch-lightning_version": "2.6.4",
         "epoch": 0,
@@ -277,6 +277,7 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
         **kept,
         "about": config.get("about"),
     }
+    return renamed_checkpoint(checkpoint)
 
 
 def config_hash(config: dict[str, Any]) -> str:

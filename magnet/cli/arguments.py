@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +10,6 @@ from magnet.cli.class_options import one_class
 from magnet.cli.config_files import Layer, read_layers
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import class_in_flags, spec_of, taken_out
-from magnet.old_names import renamed_flags, told
 
 SHOWN = ("--print_config", "--model.help", "--data.help", "--task.help")
 
@@ -34,9 +32,7 @@ class Arguments:
         named, flags = taken_out(arguments, r"(--config|-c)(=|$)")
         found = cls(flags, [flag.partition("=")[2] + "".join(value) for flag, *value in named])
         found.layers = [layer for file in found.files for layer in read_layers(file)]
-        found.flags, changed = renamed_flags(one_class(found.flags), found.class_of("model"))
-        if changed:
-            print(f"magnet: {told(changed)}", file=sys.stderr)
+        found.flags = one_class(found.flags)
         return found
 
     @property

@@ -22,8 +22,6 @@ FILE = "scenes.json"
 """What `magnet test` and `magnet score` write beside results.json."""
 SAME = ("task", "benchmark", "context frames", "horizon frames")
 """Facts that are told where they differ."""
-OPTIONS = ("sampler", "task options")
-"""Options in results.json whose single values are told where they differ."""
 
 EPILOG = """\
 A and B are folders with results of `magnet test` or `magnet score`, on the same test scenes. Compared are the first
@@ -80,10 +78,7 @@ def read(folder: Path) -> tuple[Results, SceneValues]:
     folder = folder.parent if folder.suffix == ".json" else folder
     for name in ("results.json", FILE):
         if not (folder / name).is_file():
-            raise CommandError(
-                f"{folder}: has no {name}, {wanted}; results of earlier versions have no values of single scenes, so "
-                "run the test again"
-            )
+            raise CommandError(f"{folder}: has no {name}, {wanted}")
     return Results.load_json(folder / "results.json"), SceneValues.load(folder / FILE)
 
 
@@ -144,30 +139,18 @@ def settings(results: Results, values: SceneValues, row: str) -> dict[str, Any]:
     said = values.facts.get("samples")
     found = {key: values.facts.get(key) for key in SAME}
     found["samples"] = said.get(row) if isinstance(said, dict) else said
-    for key in OPTIONS:
-        found |= single(results.meta.get(key, ""))
-    return found
-
-
-def single(options: Any) -> dict[str, Any]:
-    """Options one by one, those of options in options as `guidance.kind`.
-
-    They may be text, as Python writes objects: of a task, and in results of earlier versions of a sampler, too.
-    """
-    return flat(options) if isinstance(options, dict) else scalars(str(options))
+    return found | flat(results.meta.get("sampler", {})) | scalars(results.meta.get("task options", ""))
 
 
 def scalars(text: str) -> dict[str, Any]:
-    """Numbers, words and switches in what `repr` writes of options; those of options in options as `guidance.kind`."""
+    """Numbers, words and switches in what `repr` writes of a task."""
     try:
         node = ast.parse(text, mode="eval").body
     except (SyntaxError, ValueError):
         return {}
     found: dict[str, Any] = {}
     for each in node.keywords if isinstance(node, ast.Call) else []:
-        if isinstance(each.value, ast.Call):
-            found |= {f"{each.arg}.{key}": value for key, value in scalars(ast.unparse(each.value)).items()}
-        elif isinstance(each.value, ast.Constant | ast.UnaryOp):
+        if isinstance(each.value, ast.Constant | ast.UnaryOp):
             with contextlib.suppress(ValueError):  # such as -inf
                 found[str(each.arg)] = ast.literal_eval(each.value)
     return found

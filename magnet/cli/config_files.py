@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from typing import Any
 import yaml
 
 from magnet.cli.errors import CommandError
-from magnet.old_names import renamed_config, told
 
 EXTENDS = "extends"
 """Key under which a file names the files that it changes, relative to itself."""
@@ -53,9 +51,6 @@ def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
         raise CommandError(f"{file}: {EXTENDS} is {named!r}, expected a file or a list of files")
     before = [layer for name in named for layer in read_layers(str(Path(file).parent / name), (*within, here))]
     require_classes(file, options)
-    options, changed = renamed_config(options)
-    if changed:
-        print(f"magnet: {file}: {told(changed)}", file=sys.stderr)
     return [*before, Layer(file, options)]
 
 

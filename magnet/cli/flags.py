@@ -219,8 +219,8 @@ def mistake(arguments: Sequence[str], known: Mapping[str, Any]) -> str | None:
 
     Args:
         arguments: after the command.
-        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, `old` names by key, and `values`: what
-            options expect that take no words.
+        known: `actions` and `classes` as in `chosen_flags`, `chosen` by default, and `values`: what options
+            expect that take no words.
     """
     if any(argument.partition("=")[0] in ("-c", "--config", "--ckpt_path") for argument in arguments):
         return None
@@ -247,7 +247,7 @@ def _accepted(name: str, known: Mapping[str, Any]) -> bool:
     if key in known["classes"] and rest:
         field = rest.removeprefix("init_args.").partition(".")[0]
         fields = {option.split(".")[1] for options in known["classes"][key].values() for option in options}
-        return field in fields or field in CLASS_WORDS or field in known["old"].get(key, ())
+        return field in fields or field in CLASS_WORDS
     told = [flag for flag in known["actions"] if not flag.endswith(".help")]
     open_ones = [flag for flag in told if not any(other.startswith(f"{flag}.") for other in told)]
     return name in told or any(name.startswith(f"{flag}.") for flag in open_ones)

@@ -108,7 +108,7 @@ class SameOptimizer(Callback):
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if not checkpoint.get("optimizer_states") and trainer.state.fn == TrainerFn.FITTING:
             raise CommandError(weights_alone(self.checkpoint))
-        self.before = made_with(checkpoint)
+        self.before = checkpoint.get(MADE_WITH)
         self.fields = {**self.asked, **checkpoint.get(FIELDS, {})}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -150,17 +150,3 @@ def kept_fields(asked: Mapping[str, Mapping[str, Any]], kept: Mapping[str, Mappi
             if now != fields[name]:
                 found.append(f"--{key}.{name} {now:g}" if isinstance(now, float) else f"--{key}.{name} {now}")
     return found
-
-
-def made_with(checkpoint: dict[str, Any]) -> list[str] | None:
-    """The classes of a checkpoint's optimizers; of an older one by their fields, None where these do not tell."""
-    if MADE_WITH in checkpoint:
-        return list(checkpoint[MADE_WITH])
-    groups = [state["param_groups"][0] for state in checkpoint.get("optimizer_states") or () if state["param_groups"]]
-    names = []
-    for group in groups:
-        if "decoupled_weight_decay" in group and "muon" not in group:
-            names.append("AdamW" if group["decoupled_weight_decay"] else "Adam")
-        elif {"momentum", "dampening"} <= group.keys():
-            names.append("SGD")
-    return names if names and len(names) == len(groups) else None

@@ -11,7 +11,6 @@ from typing import Any
 from magnet import datamodules
 from magnet.body import load_body
 from magnet.cli.errors import CommandError
-from magnet.cli.run_record import with_stores
 from magnet.training import origins
 
 RECORDINGS = Path(datamodules.__file__).with_name("cmu.sha256")
@@ -52,7 +51,6 @@ def about(
     if decoder is not None:
         first, *others = origins.sources(decoder)
         before = origins.distinct([*before, first | {"part": "decoder"}, *others])
-    own, before = with_stores(own), with_stores(before)  # an earlier version did not record them as it trained
     known, all_known = ours(own), ours(own) and all(map(ours_of, before))
     require_said(known, all_known, trained_on, licence)
     everything = [own, *(each.get("data") or [] for each in before)]

@@ -36,7 +36,6 @@ from magnet.denoiser.token_model import TokenModel
 from magnet.evaluation.evaluator import Evaluator
 from magnet.files import writing
 from magnet.motion.scene import Scene
-from magnet.old_names import OPTIONS
 from magnet.precision import accelerator_of, quick_precision
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.presets import PRESETS
@@ -117,8 +116,7 @@ def help_answers(command: str) -> dict[str, Any]:
 def flag_answers(parser: Parser) -> dict[str, Any]:
     """What a command takes, as `flags.mistake` reads it."""
     chosen = {} if parser.command == "fit" else {"model": path_of(MODELS), "data": registry.default_path()}
-    old = {key: sorted(names) for key, names in OPTIONS.items()}
-    known = {"actions": parser.own_flags(), "classes": parser.options(), "chosen": chosen, "old": old}
+    known = {"actions": parser.own_flags(), "classes": parser.options(), "chosen": chosen}
     known["values"] = parser.values()
     return {f"{parser.command} flags": known}
 

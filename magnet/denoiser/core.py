@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -99,13 +99,6 @@ class DenoiserCore(TokenModelCore):
     @property
     def quantized(self) -> bool:
         return bool(self.hparams["target"] == "quantized")
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """As `TokenModel`; a posterior that the checkpoint is older than starts as it is."""
-        super().on_load_checkpoint(checkpoint)
-        if self.posterior is not None:
-            for name, value in self.posterior.state_dict().items():
-                checkpoint["state_dict"].setdefault(f"posterior.{name}", value)
 
     # -- what the model does -------------------------------------------------------------------
 

@@ -18,7 +18,6 @@ from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import FEW_SLOTS
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
-from magnet.old_names import renamed_checkpoint
 from magnet.shared import digest, is_sharing, once
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.core import TokenizerCore
@@ -119,7 +118,6 @@ class TokenModelCore(nn.Module):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Bring back the tokenizer that the checkpoint was trained with, whatever was given here."""
-        checkpoint.update(renamed_checkpoint(checkpoint))
         checkpoints.require_denoiser(checkpoint)
         self.trained_body = origins.body_of(checkpoint)
         stored = checkpoint["tokenizer_hyper_parameters"]

@@ -15,7 +15,6 @@ from torchmetrics import MeanMetric
 from magnet.body import Body
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import by_token
-from magnet.old_names import renamed_checkpoint
 from magnet.precision import require_float32_scenes
 from magnet.seeding import derive
 from magnet.tokenizer.augment import joint_noise, root_noise, swap_limbs
@@ -240,7 +239,6 @@ class Tokenizer(TokenizerCore, L.LightningModule):
         return warmup_cosine(self, trained.parameters(), self.optimizer)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint.update(renamed_checkpoint(checkpoint))
         if "tokenizer_hyper_parameters" in checkpoint:
             raise ValueError(
                 "not a tokenizer's checkpoint, it holds a denoiser; --model.start_from takes over the tokenizer in one"

@@ -30,10 +30,7 @@ def begun(*names: str | Path | None) -> Origin:
 
 
 def sources(name: str | Path) -> list[dict[str, Any]]:
-    """Weights by a model's name or a path, and behind them all those that they started from.
-
-    Of a checkpoint of an earlier version, which did not say it, what it started from is known by name alone.
-    """
+    """Weights by a model's name or a path, and behind them all those that they started from."""
     path = checkpoints.named(name)
     if not path.exists():
         return [{"name": Path(name).name}]

@@ -148,7 +148,6 @@ KNOWN = {
     ],
     "classes": {"model": {"Net": ["model.width", "model.loss.latent"]}, "data": {"Walks": ["data.root"]}},
     "chosen": {"model": "Net"},
-    "old": {"model": ["size"]},
     "values": {"--trainer.max_steps": "a whole number", "--model.width": "a number or null", "--data.root": "a number"},
 }
 
@@ -165,7 +164,6 @@ KNOWN = {
         ),  # the parser may take it as short for another
         ("--trainer.maxsteps 3", "no option --trainer.maxsteps; did you mean --trainer.max_steps?"),
         ("--model.width=3 --model.init_args.width 4 --model.loss.latent 1 --trainer.logger.save_dir x", None),
-        ("--model.size 3", None),
         ("--trainer.max_steps abc --out x", "--trainer.max_steps: got abc, expected a whole number"),
         ("--out x --model.width=wide", "--model.width: got wide, expected a number or null"),
         ("--trainer.max_steps 1e3 --model.width null", None),

@@ -17,6 +17,7 @@ from magnet import checkpoints, cli
 from magnet.cli import release
 from magnet.cli import release_record as record
 from magnet.cli.release_decoder import decoder_kept, with_decoder
+from magnet.cli.run_record import with_stores
 from magnet.datamodules.store.reader import FORMAT
 from magnet.testing import tiny_denoiser
 from magnet.training import origins
@@ -215,12 +216,10 @@ def test_recordings_of_cmu_are_acknowledged_whichever_takes_they_are(tmp_path: P
 
 
 @pytest.mark.parametrize("place", ["path", "root"])
-def test_recordings_of_cmu_in_a_store_are_acknowledged_where_it_lies_or_was_recorded(
-    place: str, tmp_path: Path
-) -> None:
+def test_recordings_of_cmu_in_a_store_are_acknowledged(place: str, tmp_path: Path) -> None:
     manifest = {"name": "cmu", "format": FORMAT, "body": {"id": "open-1"}}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    there = {**STORE, "init_args": {place: str(tmp_path)}}
+    there = with_stores({**STORE, "init_args": {place: str(tmp_path)}})
     recorded, other = {**STORE, "store": "cmu"}, {**STORE, "store": "dd100"}
     for data, owed in ((there, True), ([SYNTHETIC, {"data": recorded}], True), (recorded, True), (other, False)):
         for own, before in ((data, []), (SYNTHETIC, [{"name": "C:\\anna\\last.ckpt", "data": [data]}])):
@@ -240,7 +239,7 @@ def test_the_body_is_that_of_the_checkpoint(tmp_path: Path) -> None:
         assert record.about(checkpoint, path, "mine", "mine")["body"] == said
 
 
-def test_of_an_earlier_version_the_start_is_known_by_name_alone(tmp_path: Path) -> None:
+def test_where_nobody_recorded_the_start_it_is_known_by_name_alone(tmp_path: Path) -> None:
     checkpoint = checkpoints.read(path := run(tmp_path / "run", [STORE], []))
     del checkpoint[origins.KEY]
     checkpoint["hyper_parameters"] |= {"start_from": "duet", "tokenizer": "/home/anna/codes.ckpt"}

@@ -77,7 +77,7 @@ def test_a_tokenizer_records_what_it_started_from(tmp_path: Path) -> None:
         assert origin(tmp_path / "again.ckpt") == said
 
 
-def test_a_checkpoint_of_an_earlier_version_goes_on_without_saying_more_than_is_known(tmp_path: Path) -> None:
+def test_a_checkpoint_that_records_nothing_goes_on_without_saying_more_than_is_known(tmp_path: Path) -> None:
     fitted(build(tmp_path), 1).save_checkpoint(tmp_path / "one.ckpt")
     old = checkpoints.read(tmp_path / "one.ckpt")
     del old[origins.KEY]

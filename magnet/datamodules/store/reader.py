@@ -274,7 +274,7 @@ class StoreReader:
         end = np.cumsum(people)
         low, high = (int(end[mine[0]] - people[mine[0]]), int(end[mine[-1]])) if mine else (0, 0)
         people = people[mine] if mine else people[:0]
-        persons = [tuple(table["persons"][i]) if "persons" in table else () for i in mine]
+        persons = [tuple(table["persons"][i]) for i in mine]
         shards = self.manifest["splits"][split]["shards"]
         return StoreSplit(
             name=[table["name"][i] for i in mine],
