@@ -1,4 +1,4 @@
-"""How a training goes on: with the options of the Trainer that its run was trained with."""
+"""How a training goes on: with the options of the Trainer and the callbacks that its run was trained with."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import inspect
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.utilities import rank_zero_warn
 
 from magnet.cli.arguments import Arguments
 from magnet.cli.class_names import chosen, class_paths
@@ -15,6 +17,10 @@ from magnet.cli.errors import CommandError
 
 LIMITS = ("max_steps", "max_epochs", "max_time")
 """Options of the Trainer of which the first that is reached ends a training."""
+BY_OPTIONS = ("ModelCheckpoint", "Timer")
+"""Callbacks that options of the Trainer alone ask for."""
+AVERAGE = "current_model_state"
+"""Key of a checkpoint whose weights are an average: the weights that training goes on with."""
 
 
 def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
@@ -44,3 +50,31 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
                 f"{file} names {name}, which is not part of magnet: if you trust it, say --config {file}"
             )
     return layer
+
+
+class SameCallbacks(Callback):
+    """Says which callbacks a training goes on without, and refuses to go on from an average of weights.
+
+    Args:
+        checkpoint: the file, for messages.
+    """
+
+    def __init__(self, checkpoint: Any) -> None:
+        self.checkpoint = checkpoint
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        present: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        states = (checkpoint.get("callbacks", {}), [each.state_key for each in present])
+        had, has = ({key.partition("{")[0] for key in keys} for keys in states)
+        lost = sorted(had - has - set(BY_OPTIONS))
+        if AVERAGE in checkpoint and not any(isinstance(each, WeightAveraging) for each in present):
+            raise CommandError(
+                f"{self.checkpoint} is of a run that averages its weights ({', '.join(lost)}), and would go on from "
+                "the average: name its callbacks among --trainer.callbacks too, or begin a new run from the average, "
+                f"with --model.start_from {self.checkpoint} in place of --ckpt_path"
+            )
+        if lost:
+            rank_zero_warn(
+                f"the run goes on without {', '.join(lost)}, with which {self.checkpoint} was trained: to keep them, "
+                "name them among --trainer.callbacks too"
+            )

@@ -27,6 +27,7 @@ from magnet.cli.interrupts import EndOfStep
 from magnet.cli.parser import Parser
 from magnet.cli.quiet import quiet
 from magnet.cli.request import DEFAULT_TASK, SAMPLING, Request, read_request, refuse_task
+from magnet.cli.resumed_trainer import SameCallbacks
 from magnet.cli.run_numbers import require_numbers
 from magnet.cli.run_progress import progress_bar
 from magnet.cli.tasks import TaskChoice
@@ -261,7 +262,7 @@ class MagnetCLI(LightningCLI):
         if fit and not config.get("fast_dev_run"):
             run_folder.require_folder(self.folder)
             same = optimizers.SameOptimizer(self.checkpoint, self.config_init[self.command])
-            callbacks = [StepNumbers(), *callbacks, Duration(), same]
+            callbacks = [StepNumbers(), *callbacks, Duration(), same, SameCallbacks(self.checkpoint)]
         if fit:
             callbacks.append(self.ctrl_c)
         if not fit and config.get("enable_checkpointing") is None:
