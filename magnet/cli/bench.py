@@ -124,7 +124,7 @@ def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[s
     """What was asked of each task: those of the options that it has.
 
     Raises:
-        CommandError: an option that none of the tasks has, or a value that does not fit.
+        CommandError: an option that none of the tasks has, one that a task needs, or a value that does not fit.
     """
     from magnet.cli.tasks import parse_task, task_class
 
@@ -139,7 +139,7 @@ def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[s
     for task, own in has.items():
         said = [name for name in flags if name in own]
         words = [word for name in said for word in flags[name]]
-        fields = parse_task(task, words, command="bench").fields if said else {}
+        fields = parse_task(task, words, command=f"tasks show {task}").fields
         found[task] = {name: fields[name] for name in said}
     return found
 

@@ -131,6 +131,9 @@ def read_fields(
         return dict(parser.parse_args(flags, namespace=cfg).as_dict())
     except ArgumentError as error:
         message = str(error)
+        if missing := re.search(r"arguments are required: (.+)", message):
+            needed = " and ".join(f"--{key}" for key in missing[1].split(", "))
+            raise CommandError(f"the task needs {needed}; see {more}") from error
         unknown = re.search(r"(?:[Uu]nrecognized arguments: |Key ')([^\s=']+)", message)
         if not unknown:
             raise CommandError(wrong_value(message) or message) from error

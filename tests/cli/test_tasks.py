@@ -211,6 +211,18 @@ def test_a_mistake_is_answered_by_what_would_be_right(
     assert message in complaint(capsys, *arguments)
 
 
+@pytest.mark.parametrize("command", ["test --task needy", "tasks show needy", "bench --task needy --quick"])
+def test_an_option_that_a_task_needs_is_named_as_users_write_it(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = [("whom", int), ("at", int)]
+    needy = dataclasses.make_dataclass("Needy", fields, bases=(Foreign,), frozen=True, kw_only=True)
+    registry.discover()
+    monkeypatch.setitem(registry.TASKS.known, "needy", Registered("needy", needy, "strange-tasks 3.1"))
+    assert cli.main([*command.split(), "--task.at", "1"]) == 2
+    assert "the task needs --task.whom; see magnet " in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_show_imports_no_lightning() -> None:
     code = (
