@@ -183,6 +183,12 @@ def require_denoiser(checkpoint: Any, path: str | Path | None = None, advice: st
         raise ValueError(f"{where}not a denoiser's checkpoint, it holds {held}; {wanted}")
 
 
+def class_of(checkpoint: dict[str, Any]) -> str:
+    """The dotted path of the class that `magnet fit` trained; of others that of a `Denoiser`."""
+    model = (checkpoint.get("magnet_config") or {}).get("model") or {}
+    return str(model.get("class_path") or "magnet.Denoiser")
+
+
 def checksum_file(path: Path) -> Path:
     """The file with a checkpoint's SHA-256, in a line that `sha256sum -c` reads."""
     return path.with_name(path.name + ".sha256")

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from magnet import checkpoints
 from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import FEW_SLOTS
+from magnet.errors import warn_user
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
 from magnet.shared import digest, is_sharing, once
@@ -130,16 +131,29 @@ class TokenModelCore(nn.Module):
     def load(cls, name_or_path: str | Path | None = None) -> Self:
         """A trained model ready for use: one that comes with the package by name, or a checkpoint's path.
 
+        A warning says where it was trained as a class of somebody's own, and is loaded as another.
+
         Raises:
-            ValueError: no such checkpoint, or not a denoiser's.
+            ValueError: no such checkpoint, not a denoiser's, or of a class with other weights.
         """
         path = checkpoints.resolve(name_or_path)
         checkpoint = checkpoints.read(path, halves=True)
         checkpoints.require_denoiser(checkpoint, path)
-        fields = inspect.signature(cls).parameters  # Lightning's command line stores more than these
+        fields = taken_by(cls)  # Lightning's command line stores more than these
         stored = {name: value for name, value in checkpoint["hyper_parameters"].items() if name in fields}
         model = cls(**{**stored, **{name: None for name in ("tokenizer", "start_from") if name in fields}})
         model.on_load_checkpoint(checkpoint)
+        trained, own = checkpoints.class_of(checkpoint), cls.__name__.removesuffix("Core")
+        name = trained.rpartition(".")[2]
+        other = not trained.startswith("magnet.") and name not in [each.__name__ for each in cls.__mro__]
+        if lost := sorted(model.state_dict().keys() ^ checkpoint["state_dict"].keys()):
+            hint = f"; it was trained as {trained}: load it with {name}.load" if other else ""
+            raise ValueError(f"{path}: holds other weights than a {own} of its options has, such as {lost[0]}{hint}")
+        if other:
+            warn_user(
+                f"{path} was trained as {trained}, and is a plain {own} here: what that class does otherwise is left "
+                f"out. In Python, magnet.Model({name}.load(path)) keeps it"
+            )
         model.load_state_dict(checkpoint["state_dict"])
         return model.float().eval()  # also where torch's default is another dtype
 
@@ -213,3 +227,15 @@ def each_slot(scene: Scene) -> Scene:
         body=scene.body,
         valid=None if scene.valid is None else scene.valid.repeat_interleave(P, dim=0),
     )
+
+
+def taken_by(kind: type) -> set[str]:
+    """Names of what a class is made with, and of what it hands on to those that it is made of (`**kwargs`)."""
+    names: set[str] = set()
+    for each in kind.__mro__:
+        if "__init__" in vars(each):
+            parameters = inspect.signature(each).parameters
+            names |= set(parameters)
+            if all(parameter.kind != inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
+                break
+    return names

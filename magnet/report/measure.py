@@ -83,9 +83,7 @@ def load(path: str) -> Any:
     Raises:
         ValueError: a checkpoint of something that is not ours.
     """
-    stored = checkpoints.read(checkpoints.resolve(path))
-    trained = stored.get("magnet_config", {}).get("model") or {}
-    kind = str(trained.get("class_path") or "magnet.Denoiser")
+    kind = checkpoints.class_of(checkpoints.read(checkpoints.resolve(path)))
     if not kind.startswith("magnet."):
         raise ValueError(f"{path}: is of {kind}, expected a model of magnet")
     module, _, name = kind.rpartition(".")

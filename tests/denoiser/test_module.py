@@ -5,6 +5,8 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 
+import magnet
+from magnet import checkpoints
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
@@ -240,6 +242,32 @@ def test_a_scene_is_validated_with_the_same_noise_in_any_batch():
 def test_a_scene_is_validated_with_the_same_noise_in_any_process(tmp_path):
     mp.spawn(one_of_two, args=(free_port(), str(tmp_path)), nprocs=2)
     assert [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)] == pytest.approx([validated(3)] * 2, rel=1e-5)
+
+
+class Mine(Denoiser):
+    """A class of somebody's own, with one more option and, where it is `wide`, one more weight."""
+
+    def __init__(self, *args, extra: float = 0.5, wide: bool = False, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        self.save_hyperparameters("extra", "wide")
+        if wide:
+            self.more = torch.nn.Parameter(torch.zeros(1))
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_class_of_ones_own_is_loaded_with_its_options_and_as_a_plain_denoiser_not_unsaid(wide, tmp_path):
+    made = Mine("raw", 2, window=8, extra=0.9, wide=wide, noise={"shift": 5.0}, **SIZES)
+    path = save(made, tmp_path / "mine.ckpt")
+    checkpoint = checkpoints.read(path) | {"magnet_config": {"model": {"class_path": f"{__name__}.Mine"}}}
+    checkpoints.save(checkpoint, Path(path))
+    own = Mine.load(path)
+    assert (own.hparams["extra"], own.noise.shift, own.network.layers) == (0.9, 5.0, 1) and same_weights(own, made)
+    if wide:
+        with pytest.raises(ValueError, match=r"such as more; it was trained as .*\.Mine: load it with Mine\.load"):
+            Denoiser.load(path)
+    else:
+        with pytest.warns(UserWarning, match=r"trained as .*\.Mine, and is a plain Denoiser here: .*Mine\.load\(path"):
+            assert magnet.load(path).denoiser.noise.shift == 5.0
 
 
 def test_absent_agents_cost_nothing(generator):
