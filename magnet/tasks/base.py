@@ -42,7 +42,7 @@ def task_of(name: str, said: Mapping[str, Any]) -> Task:
     """A task by its name, with what is said of its fields.
 
     Raises:
-        ValueError: no such task or field, with those that there are.
+        ValueError: no such task or field, with those that there are, or none of a field that it needs.
     """
     kind = get(name)
     known = [each.name for each in dataclasses.fields(kind)]
@@ -52,8 +52,16 @@ def task_of(name: str, said: Mapping[str, Any]) -> Task:
             of_sampling = field in ("sampler", *(each.name for each in dataclasses.fields(SamplerOptions)))
             hint = "; how to sample is said of the model: magnet.load(name, sampler=...)" if of_sampling else ""
             raise ValueError(f"task {name} has no field {field}; {has}{hint}")
+    if lacking := [name for name in needed(kind) if name not in said]:
+        raise ValueError(f"task {name} needs {' and '.join(lacking)}, which is not given")
     task: Task = kind(**said)
     return task
+
+
+def needed(kind: type) -> list[str]:
+    """The fields of a task that have no value by default."""
+    missing, fields = dataclasses.MISSING, dataclasses.fields(kind)
+    return [each.name for each in fields if each.init and each.default is missing and each.default_factory is missing]
 
 
 def schedule_of(task: Task, grid: Grid) -> MaskSchedule:
@@ -79,8 +87,7 @@ def schedule_of(task: Task, grid: Grid) -> MaskSchedule:
 
 def fault_of(kind: type[Task]) -> str | None:
     """What is wrong with a task's code, by a plan on `SMALL`; None: nothing, or it needs options or another grid."""
-    missing = dataclasses.MISSING
-    if any(field.default is missing and field.default_factory is missing for field in dataclasses.fields(kind)):  # type: ignore[arg-type]
+    if needed(kind):
         return None
     error = attempted(lambda: schedule_of(kind(), SMALL))
     if error is None or (isinstance(error, ValueError) and not isinstance(error, TaskError)):

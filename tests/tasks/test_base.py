@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
+from magnet.plugins import Registered
+from magnet.tasks import registry
 from magnet.tasks.base import task_of
 from magnet.tasks.partner import MotionControl
 
@@ -17,3 +21,12 @@ def test_a_field_that_a_task_has_not_is_told_with_those_that_it_has(field: str, 
     with pytest.raises(ValueError, match=f"task motion_control has no field {field}; it has target, block{hint}"):
         task_of("motion_control", {"target": (1,), field: 2})
     assert task_of("motion_control", {"target": (1,)}) == MotionControl(target=(1,))
+
+
+def test_a_field_that_a_task_needs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    needy = dataclasses.make_dataclass("Needy", [("whom", int)], bases=(MotionControl,), frozen=True, kw_only=True)
+    registry.discover()
+    monkeypatch.setitem(registry.TASKS.known, "needy", Registered("needy", needy, "strange-tasks 3.1"))
+    with pytest.raises(ValueError, match="task needy needs whom, which is not given"):
+        task_of("needy", {"target": (1,)})
+    assert task_of("needy", {"whom": 0}) == needy(whom=0)
