@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from types import MethodType
 from typing import Any
 
@@ -59,6 +60,21 @@ def choose_optimizer(model: LightningModule, config: Namespace) -> None:
         return LightningCLI.configure_optimizers(self, made, steps)
 
     model.configure_optimizers = MethodType(configure_optimizers, model)  # type: ignore[method-assign]
+
+
+def refuse_both(flags: Sequence[str], config: Namespace) -> None:
+    """Refuse options of a model's own optimizer beside another, which would have no say.
+
+    Raises:
+        CommandError: names the first such flag.
+    """
+    own = r"--model\.(init_args\.)?optimizer[.=]"
+    if config.get("optimizer") and (both := next((flag for flag in flags if re.match(own, flag)), None)):
+        name = plain(config["optimizer"])["class_path"].rpartition(".")[2]
+        raise CommandError(
+            f"{both.partition('=')[0]} is of the model's own optimizer, and has no say beside --optimizer {name}: give "
+            "--optimizer.FIELD, such as --optimizer.lr, or leave --optimizer out"
+        )
 
 
 def plain(chosen: Namespace | dict[str, Any]) -> dict[str, Any]:

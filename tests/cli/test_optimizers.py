@@ -40,6 +40,16 @@ def test_a_scheduler_alone_drives_the_models_own_optimizer(toy: None) -> None:
     assert type(optimizer) is torch.optim.SGD and optimizer.param_groups[0]["lr"] == pytest.approx(0.005)
 
 
+@pytest.mark.parametrize("flag", ["--model.optimizer.muon=3", "--model.init_args.optimizer.learning_rate"])
+def test_options_of_the_models_own_optimizer_are_refused_beside_another(
+    toy: None, capsys: pytest.CaptureFixture[str], flag: str
+) -> None:
+    model = ["--model", "magnet.denoiser.module.Denoiser", "--model.tokenizer", "raw"]
+    words = ["fit", *model, *QUIET, "--optimizer", "SGD", flag]
+    assert cli.main([*words, *([] if "=" in flag else ["0.1"])]) == 2
+    assert f"{flag.partition('=')[0]} is of the model's own optimizer" in capsys.readouterr().err
+
+
 def test_without_either_the_models_own_trains(toy: None) -> None:
     (optimizer,) = trained().optimizers
     assert type(optimizer) is torch.optim.SGD and optimizer.param_groups[0]["lr"] == 0.5
