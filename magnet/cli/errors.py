@@ -41,6 +41,8 @@ def explain(error: Exception) -> str | None:
             "another process of this training has ended, and so does this one; its own log says why. To go on from "
             "the last checkpoint, run the same command with --ckpt_path last (--debug shows where)"
         )
+    if isinstance(error, RuntimeError) and "--ntasks-per-node" in text:  # Lightning's, of SLURM
+        return f"{text} Or start one process alone, by srun --ntasks=1."
     if isinstance(error, MemoryError) or re.search(SHORT, text):
         return (
             "this takes more memory than there is: ask for less at a time, such as a smaller --data.batch_size or "

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from lightning.fabric.plugins.environments import SLURMEnvironment
 
 from magnet.cli.errors import explain
 
@@ -85,3 +86,11 @@ def test_what_torch_says_of_a_lost_process_becomes_what_to_do(monkeypatch: pytes
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert "--ckpt_path last" in (explain(lost) or "")
     assert explain(RuntimeError("shapes do not fit")) is None
+
+
+def test_what_lightning_says_of_slurm_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_NTASKS", "4")
+    monkeypatch.delenv("SLURM_NTASKS_PER_NODE", raising=False)
+    with pytest.raises(RuntimeError) as refused:
+        SLURMEnvironment()
+    assert "Use `--ntasks-per-node=4`" in (explain(refused.value) or "")
