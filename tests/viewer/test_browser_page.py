@@ -88,8 +88,28 @@ def test_the_page_plays_scrubs_and_changes_its_look_without_any_network(page, ha
     page.wait_for_function("document.getElementById('state').textContent === 'given'")
     page.keyboard.press("ArrowRight")
     assert page.evaluate("player.frame") == 4
+    page.wait_for_function("document.getElementById('time').value === '4'")
     page.click("#play")
     page.wait_for_function("player.frame > 4")
+    page.click("#play")  # which has the keys now
+    stopped = page.evaluate("player.frame")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("[player.frame, player.playing]") == [stopped + 1, False]
+
+
+def test_who_comes_back_to_the_page_finds_controls_that_say_how_it_plays(page, handshake, body, tmp_path) -> None:
+    page.goto(save_html(handshake, tmp_path / "a.html", body, styles=("skeleton",)).as_uri())
+    page.wait_for_function("window.player && player.drawn > 0")
+    page.select_option("#speed", "0.25")
+    page.click("#loop")
+    page.goto("about:blank")
+    page.go_back()
+    page.wait_for_function("window.player && player.drawn > 0")
+    player = page.evaluate("[player.speed, player.loop]")
+    assert (
+        page.evaluate("[Number(document.getElementById('speed').value), document.getElementById('loop').checked]")
+        == player
+    )
 
 
 def test_the_page_draws_what_the_body_says(page, handshake, body, tmp_path) -> None:
@@ -199,6 +219,21 @@ def test_the_page_marks_how_deep_people_are_in_each_other_until_marks_are_off(pa
     page.locator("#marks").click()
     after = looked_at("page_marks_off", "")
     assert reddish(after)[40:380].sum() < 10 and reddish(after)[400:].sum(axis=1).max() < 40
+
+
+def test_everybody_is_in_the_picture_of_a_phone_held_upright_or_turned(page, handshake, body, tmp_path) -> None:
+    three = handshake.repeat(3).replace(names=())
+    page.set_viewport_size({"width": 390, "height": 700})
+    page.goto(save_html(three, tmp_path / "a.html", body, styles=("skeleton",)).as_uri())
+    for width, height in ((390, 700), (700, 390), (390, 700)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_function(f"window.player && player.drawn > 0 && player.picture.canvas.width === {width}")
+        places = page.evaluate(
+            "player.view.shown.map(({ index }) => player.picture.onPage(player.motion.root(index, 0)))"
+        )
+        x, y = np.transpose(places)
+        assert x.min() > 0 and x.max() < width and np.ptp(x) > 0.4 * width
+        assert y.min() > 0 and y.max() < height
 
 
 @pytest.mark.parametrize("camera", ["front", "side", "above"])

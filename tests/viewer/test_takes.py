@@ -27,6 +27,13 @@ def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path,
     assert {each.label for each in found} == {"dance · 1", "dance · 2"}
 
 
+def test_samples_that_have_names_are_named_by_their_file_and_these(scene: Scene) -> None:
+    samples = scene.replace(names=("sample 1", "sample 2"))
+    assert [each.label for each in takes(samples, "dance")] == ["dance · sample 1", "dance · sample 2"]
+    assert [each.label for each in takes(samples.select([1]), "dance")] == ["sample 2"]
+    assert [each.label for each in takes(scene.replace(names=("a", "a")), "dance")] == ["a · 1", "a · 2"]
+
+
 def test_labels_that_end_in_a_number_are_not_given_to_others(duet: Scene) -> None:
     labels = ["a", "a", "a (1)", "b", "a"]
     named = [each.label for each in numbered([take(label, duet) for label in labels])]
@@ -67,7 +74,7 @@ def test_a_scene_that_says_what_was_given_knows_better_than_a_context(duet: Scen
     said = duet.replace(given=given)
     shown = take("x", said, context=8)
     assert (shown.known == given[0].numpy()).all()
-    assert [shown.said(frame) for frame in (4, 5)] == ["", "given: person 1"]
+    assert [shown.said(frame) for frame in (4, 5, duet.frames)] == ["", "given: person 1", "ended"]
     assert take("x", duet, context=8).scene.given.sum() == 16
     assert take("x", duet).scene.given is None
 

@@ -140,6 +140,7 @@ def _contents(
         "frames": longest.frames,
         "people": people,
         "takes": [each.label for each in shown],
+        "lengths": [each.frames for each in shown],
         "parents": list(PARENTS),
         "styles": list(styles),
         "unit": reach / FULL,

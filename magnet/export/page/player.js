@@ -4,6 +4,7 @@ const PRESETS = { "three quarters": [0.65, 0.3], front: [0, 0.12], side: [Math.P
 const ALL = -1; // takes, side by side
 const HEAD_HIGH = 2.3; // metres, where a take's label is
 const DEPTHS = 5; // pixels of the timeline's stripe of depths
+const FARTHEST = 80; // metres that the camera may be away
 const MOMENTS = 21; // at which is measured how much room people take
 
 // A stripe of the timeline: a background of CSS with a colour for each frame.
@@ -101,7 +102,7 @@ class View {
   }
 
   zoom(factor) {
-    this.distance = Math.min(Math.max(this.distance * factor, 0.8), 80);
+    this.distance = Math.min(Math.max(this.distance * factor, 0.8), FARTHEST);
   }
 
   // One finger or the left button turns, the right button or shift moves, two fingers or the wheel zoom.
@@ -151,6 +152,7 @@ class Player {
     this.picture = new Picture(canvas, meta, arrays);
     this.view = new View(canvas, meta, arrays);
     this.labels = meta.takes.map(() => document.getElementById("labels").appendChild(document.createElement("div")));
+    for (const label of this.labels) label.style.maxWidth = `min(24ch, ${100 / meta.takes.length}%)`; // side by side
     this.controls();
     this.choose(ALL);
     let last = performance.now();
@@ -180,10 +182,25 @@ class Player {
       const along = [0, 2].map((k) => roots.map((root) => root[k]));
       return Math.max(...along.map((places) => Math.max(...places) - Math.min(...places)));
     });
-    const wide = widths.sort((a, b) => a - b)[Math.floor(0.8 * (MOMENTS - 1))];
-    view.distance = Math.max(3.6, 2.2 * (wide / 2 + 0.7));
+    widths.sort((a, b) => a - b);
+    [this.half, this.widest] = [0.8, 1].map((share) => widths[Math.floor(share * (MOMENTS - 1))] / 2 + 0.7);
+    view.distance = this.needed = this.far();
     view.goTo(this.centre(), 1);
     this.ribbon();
+  }
+
+  // Metres from which the people fill the picture, and from which a narrow one, such as a phone's, holds all of them.
+  far() {
+    const { clientWidth, clientHeight } = this.picture.canvas;
+    const aspect = clientWidth / clientHeight || 1; // a folded frame has no size
+    return Math.min(Math.max(3.6, 2.2 * this.half, this.widest / (Math.tan(FIELD / 2) * aspect)), FARTHEST);
+  }
+
+  // As near or far as somebody has zoomed, in a window of another shape.
+  resized() {
+    const before = this.needed;
+    this.needed = this.far();
+    this.view.zoom(this.needed / before);
   }
 
   ribbon() {
@@ -222,7 +239,7 @@ class Player {
     const { meta, frame } = this;
     const get = (id) => document.getElementById(id);
     get("play").textContent = this.playing ? "Pause" : "Play";
-    if (document.activeElement !== get("time") || this.playing) get("time").value = frame;
+    get("time").value = frame;
     get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
     const alone = meta.takes.length === 1 || this.view.take !== ALL;
     get("state").textContent = alone ? this.said(this.view.shown, this.view.take) : "";
@@ -239,8 +256,9 @@ class Player {
     }
   }
 
-  // What was given in this frame, and how deep people are in each other.
+  // What was given in this frame, and how deep people are in each other; or that they have come to their last one.
   said(people, take) {
+    if (this.frame >= this.meta.lengths[people[0].take]) return "ended";
     const depth = this.view.marks ? this.picture.marks.deepest(this.frame, take) : 0;
     const deep = depth > 0 ? `${Math.round(100 * depth)} cm in each other` : "";
     return [this.view.said(this.frame, people), deep].filter((text) => text).join(" \u00b7 ");
@@ -255,6 +273,8 @@ class Player {
   controls() {
     const get = (id) => document.getElementById(id);
     const { meta, view } = this;
+    // Who comes back to the page finds it as it plays, not with choices that the browser has kept.
+    for (const control of document.querySelectorAll("input, select")) control.autocomplete = "off";
     get("time").max = meta.frames - 1;
     get("time").addEventListener("input", (event) => this.seek(Number(event.target.value)));
     get("play").addEventListener("click", () => this.play(!this.playing));
@@ -277,8 +297,11 @@ class Player {
     });
     get("follow").addEventListener("change", (event) => (view.follow = event.target.checked));
     get("from").addEventListener("change", (event) => view.preset(event.target.value));
+    window.addEventListener("resize", () => this.resized());
     document.addEventListener("keydown", (event) => {
-      if (["INPUT", "SELECT", "BUTTON"].includes(event.target.tagName) && event.target.type !== "range") return;
+      const { tagName, type } = event.target;
+      if (tagName === "SELECT") return;
+      if (event.key === " " && (tagName === "BUTTON" || type === "checkbox")) return; // which it presses
       if (event.key === " ") this.play(!this.playing);
       else if (event.key === "ArrowLeft") this.seek(this.frame - 1);
       else if (event.key === "ArrowRight") this.seek(this.frame + 1);

@@ -43,8 +43,10 @@ class ShownTake:
         return self.scene.frames
 
     def said(self, frame: int) -> str:
-        """Whose motion a model was given in a frame, after the last one in that; empty where nobody's."""
-        known = self.known[min(frame, len(self.known) - 1)]
+        """Whose motion a model was given in a frame, empty where nobody's; after the last one that it has ended."""
+        if frame >= len(self.known):
+            return "ended"
+        known = self.known[frame]
         if known.all():
             return "given"
         those = ", ".join(f"person {slot + 1}" for slot, here in zip(self.slots, known, strict=True) if here)
@@ -79,13 +81,12 @@ def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace |
 
 
 def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLES) -> list[ShownTake]:
-    """The first `samples` scenes of a file, each as a take."""
-    names = [name or label for name in scene.names] if scene.names else [label] * scene.scenes
-    many = scene.scenes > 1
-    return [
-        take(f"{names[b]} · {b + 1}" if many else names[b], scene.select([b]), context)
-        for b in range(min(scene.scenes, samples))
-    ]
+    """The first `samples` scenes of a file, each as a take, named by the file and its own name or number there."""
+    names = [name or label for name in scene.names or [""] * scene.scenes]
+    if scene.scenes > 1:
+        named = "" not in scene.names and len(set(scene.names)) == scene.scenes
+        names = [f"{label} · {name}" if named else f"{name} · {b + 1}" for b, name in enumerate(names)]
+    return [take(names[b], scene.select([b]), context) for b in range(min(scene.scenes, samples))]
 
 
 def same_length(one: ShownTake, other: ShownTake) -> Scene:
