@@ -61,7 +61,7 @@ class ViewerBase:
         self.views: list[SceneView] = []
         self.lock = threading.RLock()
         self.follow, self.centre = True, np.zeros(3)
-        self.shown = -1
+        self.shown = self.tracked = -1  # frames that the people and the timeline show
         self.sent = 0
         self.unsettled: float | None = None  # when a person moved the slider
         self._stop = threading.Event()
@@ -246,10 +246,11 @@ class ViewerBase:
     # -- showing -------------------------------------------------------------------------------
 
     def draw(self) -> None:
-        """Show the clock's frame, unless it is shown already."""
+        """Show the clock's frame, unless it is shown already; the timeline while it plays only now and then."""
         with self.lock:
             frame = self.clock.frame
-            if frame == self.shown or not self.views:
+            shown = frame == self.shown and (self.clock.playing or frame == self.tracked)
+            if shown or not self.views:
                 return
             jump = abs(frame - self.shown) > 5
             with self.server.atomic():
@@ -260,6 +261,7 @@ class ViewerBase:
                 self.slider.value = frame
                 if frame % 3 == 0 or jump or not self.clock.playing:
                     self.timeline.show(self.tracks(), frame, self.clock.fps)
+                    self.tracked = frame
                 self.clock_text.content = self.caption(frame)
             self.shown = frame
             self.sent += 1
@@ -317,9 +319,9 @@ class ViewerBase:
                 state += f" · standing feet: {facts.get('feet', 0):.0f} · touching hands: {facts.get('hands', 0):.0f}"
             if self.render.collisions and facts.get("deepest", 0.0) > 0:
                 state += f" · **{100 * facts['deepest']:.0f} cm inside each other**"
-            label = f"{view.take.label}: " if len(self.views) > 1 else ""
-            lines.append(f"{label}{state.removeprefix(' · ')}")
-        return "  \n".join(lines)
+            state = state.removeprefix(" · ")
+            lines.append(f"{view.take.label}: {state}" if state and len(self.views) > 1 else state)
+        return "  \n".join(filter(None, lines))
 
     def settle(self, now: float) -> None:
         """Set the slider again after the user released it: frames in transit may have moved it."""

@@ -146,6 +146,7 @@ class LiveApp(ViewerBase):
                 self.views[0].take = take("", scene)
                 self.clock.frames = scene.frames
                 self.slider.max = scene.frames - 1
+                self.tracked = -1  # who has paused sees a longer timeline
             self.worker.watch(self.clock.frame)
 
     def tracks(self) -> Tracks:
@@ -163,8 +164,8 @@ class LiveApp(ViewerBase):
         """Text of the panel for a frame."""
         live, rate = self.live, self.live.scene.fps
         speed = f"{live.fps:.0f} frames/s, {live.fps / rate:.1f}x real time" if live.made else "not generated yet"
-        ended = frame >= live.scene.frames - 1
-        waits = " · **waiting for the model**" if ended and not self.worker.paused else ""
+        waiting = frame >= live.scene.frames - 1 and self.clock.playing and not self.worker.paused
+        waits = " · **waiting for the model**" if waiting else ""
         rests = " · the model rests while it loops" if self.clock.loop else ""
         lines = [super().caption(frame), f"generates {speed}{waits}{rests}", self.news]
         return "  \n".join([line for line in lines if line] + [f"**{self.refusal}**"] * bool(self.refusal))

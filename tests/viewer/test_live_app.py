@@ -131,3 +131,19 @@ def test_the_page_says_why_a_scene_does_not_begin(app: Any, controls: dict[str, 
     for pressed in controls["Start anew"]._impl.update_cb:
         pressed(SimpleNamespace(client_id=7))
     assert "FileNotFoundError: " in app.caption(0)
+
+
+def test_who_pauses_sees_how_far_the_model_has_come_and_waits_for_nothing(app: Any) -> None:
+    app.worker.stop()
+    last = app.live.scene.frames - 1
+    app.clock.seek(last)
+    app.draw()
+    app.worker.paused = False
+    assert "waiting for the model" in app.caption(last)
+    app.clock.play(False)
+    assert "waiting for the model" not in app.caption(last)
+    app.live.advance()
+    app.before_draw()
+    app.draw()
+    frames = app.live.scene.frames
+    assert frames > last + 1 and f"of {frames / 30:.1f} s" in app.clock_text.content

@@ -13,6 +13,7 @@ import torch
 from magnet.export.page.palette import pale
 from magnet.export.page.takes import take
 from magnet.testing import random_scene
+from magnet.viewer.scene_view import RenderOptions
 from magnet.viewer.timeline import EDGE, NOW, Tracks, drawn
 
 COLOURS = np.array([[10, 20, 30], [200, 100, 50]], dtype=np.uint8)
@@ -64,6 +65,22 @@ def test_the_timeline_is_as_wide_as_the_picture_and_nothing_happens_while_nobody
     assert EDGE > 0
 
 
+def test_who_pauses_sees_the_line_of_now_at_the_frame_that_is_shown(body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    viewer = Viewer([take("dance", random_scene(1, 25, 2, torch.Generator().manual_seed(1)))], body, port=0)
+    try:
+        for frame in (3, 4, 5):
+            viewer.clock.seek(frame)
+            viewer.draw()
+        viewer.clock.play(False)
+        viewer.draw()
+        assert bars(viewer.timeline.picture.content, NOW)[0] == pytest.approx(100 * 5 / 25)
+    finally:
+        viewer.stop()
+
+
 def test_a_take_that_ends_before_the_others_is_not_given_again(body) -> None:
     pytest.importorskip("viser")
     from magnet.viewer.watch import Viewer
@@ -73,9 +90,12 @@ def test_a_take_that_ends_before_the_others_is_not_given_again(body) -> None:
     viewer = Viewer(takes, body, port=0)
     try:
         known = viewer.tracks().known
+        viewer.render = RenderOptions(contacts=False)
+        captions = [viewer.caption(frame).split("  \n") for frame in (7, 8, 24)]
     finally:
         viewer.stop()
     assert known[:8].all() and not known[8:].any()
+    assert [lines[1:] for lines in captions] == [["24: given", "60: given"], [], ["24: ended"]]
 
 
 def test_takes_whose_names_differ_in_signs_alone_stand_side_by_side(body) -> None:
