@@ -63,6 +63,20 @@ def motion_of(poses: np.ndarray, betas: Sequence[float]) -> Scene:
     return Scene(rotations[None, :, None, 1:], T_world_root, shape, torch.ones(1, 1, dtype=torch.bool))
 
 
+def motion_told(told: Sequence[Message]) -> Scene:
+    """One person's frames as messages told them, the first after the start scene first. -> (1, T, 1)
+
+    Frames between them that nobody told, as where an agent joined later or went on where the others were, are held and
+    not valid, so that files of several agents are of one time.
+    """
+    made = cat_time([motion_of(each.poses, each.betas) for each in told])
+    numbers = torch.tensor([each.frame + k for each in told for k in range(len(each.poses))])
+    frames = torch.arange(int(numbers[-1]) + 1)
+    index = (torch.searchsorted(numbers, frames, right=True) - 1).clamp(min=0)
+    there = numbers[index] == frames
+    return made.frames_at(index).replace(valid=None if bool(there.all()) else there[None])
+
+
 class Notebook:
     """What has been heard of everybody, token by token; 0 is the first token after the start scene.
 

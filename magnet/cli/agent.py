@@ -167,11 +167,10 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
 
 def take_part(given: argparse.Namespace, member: Member, link: Link, others: set[str]) -> None:
     """Run until it is over, and write what was asked for."""
-    from magnet.agents.agent import Agent, motion_of
+    from magnet.agents.agent import Agent, motion_told
     from magnet.agents.gate import Gate
     from magnet.agents.message import Message
     from magnet.agents.run import PERIOD, Process
-    from magnet.motion.scene import cat_time
 
     told: list[Message] = []
     code, latent = (member.print, member.model.layout.latent) if isinstance(member, Agent) else ("", 0)
@@ -189,6 +188,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
     )
     for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
         signal.signal(number, signal.default_int_handler)
+    print(f"magnet agent: {given.name} is at {given.listen}   (Ctrl+C ends it)", file=sys.stderr, flush=True)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))
     if process.unheard:
@@ -200,5 +200,11 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
 
         write_text(given.report, json.dumps(report, indent=1) + "\n")
     if given.out is not None and told:
-        made = cat_time([motion_of(each.poses, each.betas) for each in told])
-        print(f"written: {made.replace(body=member.start.body).save(given.out)}")
+        made = motion_told(told).replace(body=member.start.body)
+        print(f"written: {made.save(given.out)}")
+        if made.valid is not None:
+            print(
+                f"magnet: {int((~made.valid).sum())} of its {made.frames} frames were not made, where {given.name} "
+                "joined later or went on where the others were: they are held, and marked as not valid",
+                file=sys.stderr,
+            )

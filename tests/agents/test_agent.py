@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.agents.agent import Agent, Player, motion_of, poses_of
+from magnet.agents.agent import Agent, Player, motion_of, motion_told, poses_of
 from magnet.agents.gate import Gate
 from magnet.agents.message import pack
 from magnet.denoiser.options import Sampling
@@ -234,3 +234,17 @@ def test_what_cannot_be_is_named(denoiser, start):
         Agent(denoiser, start, NAMES, "A", AgenticAsync(offset=0.5))
     with pytest.raises(ValueError, match="settle_blocks"):
         Agent(denoiser, start, NAMES, "A", AgenticSync(), SamplerOptions(settle="light", settle_blocks=True))
+
+
+def test_frames_of_who_joined_later_or_went_on_elsewhere_are_kept_at_their_times(start: Scene) -> None:
+    recording = start.permute_agents(torch.tensor([0]))
+    player, told = Player(recording, start, NAMES, "A"), []
+    for token in (1, 2, 5):
+        player.join(token)
+        told.append(player.step())
+    made, there = motion_told(told), torch.zeros(24, dtype=torch.bool)
+    there[4:12] = there[20:24] = True
+    assert made.valid is not None and torch.equal(made.valid[0], there)
+    torch.testing.assert_close(made.T_world_root[0, there, 0], start.T_world_root[0, there, 0], atol=1e-5, rtol=0)
+    assert (made.T_world_root[0, 12:20] == made.T_world_root[0, 11]).all()
+    assert motion_told([Player(recording, start, NAMES, "A").step()]).valid is None
