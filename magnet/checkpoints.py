@@ -38,7 +38,7 @@ HUB = "hub:"
 """Prefix of the name of a model on Hugging Face's hub: hub:owner/name, or hub:owner/name@revision."""
 HUB_FILES = ["config.json", "*.safetensors", "README.md"]
 
-MOTION = (".npz", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
+MOTION = (".npz", ".pkl", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
 """Suffixes of scenes, which are no checkpoints: `magnet.export.reading.READ`, which this may not import."""
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config")
 

@@ -67,6 +67,18 @@ def load_object_npy(path: str | Path) -> Any:
     return found
 
 
+def mapping(where: object, held: Any) -> Mapping[str, Any]:
+    """What a file holds, when it is a dict with text keys.
+
+    Raises:
+        DataError: it is not.
+    """
+    if not isinstance(held, Mapping) or not all(isinstance(key, str) for key in held):
+        what = f"an array {held.shape}" if isinstance(held, np.ndarray) else f"a {type(held).__name__}"
+        raise DataError(f"{where}: holds {what}, expected a dict of named arrays; is it another file of the data set?")
+    return held
+
+
 # -- npy ---------------------------------------------------------------------------------------
 
 
@@ -231,6 +243,13 @@ ADMITTED: dict[str, Callable[..., Any]] = {
 """Everything that a pickle may name; numpy's are replaced by stand-ins."""
 
 
+BY_HAND = {
+    "joblib.": "open it with joblib.load, as joblib wrote it,",
+    "torch.": "load it yourself, make arrays of its tensors by .cpu().numpy()",
+}
+"""How a trusted file of some packages' classes is opened, by how their modules begin."""
+
+
 class _Restricted(pickle.Unpickler):
     def __init__(self, data: bytes, where: str, also: Also) -> None:
         super().__init__(io.BytesIO(data), encoding="latin-1")
@@ -240,10 +259,11 @@ class _Restricted(pickle.Unpickler):
         """Only what is admitted."""
         admitted = ADMITTED.get(f"{module} {name}") or self.also(module, name)
         if admitted is None:
+            by_hand = next((how for package, how in BY_HAND.items() if module.startswith(package)), "load it yourself")
             raise DataError(
                 f"{self.where}: the pickle names {module}.{name}, which is not loaded because a pickle can run code; "
-                "expected numpy arrays, numbers, text, dict, list and tuple. If you trust the file, load it yourself "
-                "and save plain arrays"
+                f"expected numpy arrays, numbers, text, dict, list and tuple. If you trust the file, {by_hand} and "
+                "save plain arrays"
             )
         return admitted
 

@@ -159,3 +159,17 @@ def test_a_missing_file_and_a_folder_are_data_errors(tmp_path: Path) -> None:
         load_pickle(tmp_path / "none.pkl")
     with pytest.raises(DataError, match="is a folder, expected a file"):
         load_object_npy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("module", "how"),
+    [
+        ("joblib.numpy_pickle", "open it with joblib.load, as joblib wrote it, and save plain arrays"),
+        ("torch._utils", r"make arrays of its tensors by \.cpu\(\)\.numpy\(\) and save plain arrays"),
+        ("posix", "load it yourself and save plain arrays"),
+    ],
+)
+def test_what_is_refused_is_said_with_how_a_trusted_file_is_opened(module: str, how: str, tmp_path: Path) -> None:
+    (tmp_path / "file.pkl").write_bytes(f"c{module}\nAnything\n.".encode())
+    with pytest.raises(DataError, match=f"If you trust the file, .*{how}"):
+        load_pickle(tmp_path / "file.pkl")

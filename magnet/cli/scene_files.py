@@ -29,7 +29,7 @@ OF_FILES = (
 RECORDED = (".npz", ".bvh")
 """Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
 again."""
-IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz, .csv without it"}
+IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz, .pkl, .csv without it"}
 """An option of commands that read files."""
 START: dict[str, Any] = {
     "type": int,
@@ -57,7 +57,7 @@ def parser_of(command: str, description: str | None, epilog: str, inputs: str = 
         "inputs",
         nargs=inputs,
         metavar="IN",
-        help="a .npz, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people",
+        help="a .npz, .pkl, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people",
     )
     return options
 

@@ -50,7 +50,7 @@ over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:loc
 def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
-    files = "scenes (.npz), SMPL-X motion (.npz), recordings of denoising, .bvh, .glb, .gltf, .vrma, .fbx, .csv"
+    files = "scenes (.npz), SMPL-X motion (.npz, .pkl), recordings of denoising, .bvh, .glb, .gltf, .vrma, .fbx, .csv"
     parser.add_argument("files", nargs="*", metavar="FILE", help=files)
     add = parser.add_argument_group("what is shown").add_argument
     add("--truth", metavar="FILE", help="a scene to show as ghosts in each of the others (default: none)")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from magnet.datamodules.reading.arrays import AGAIN, gap_note
+from magnet.datamodules.reading.arrays import AGAIN
 from magnet.datamodules.reading.own_files import PersonFile
 from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.reading.rigs import RigReader, RigTrack
 from magnet.datamodules.registry import register_reader
 from magnet.export.bvh_read import read_bvh
+from magnet.export.smpl_people import gap_note
 
 
 @register_reader

@@ -11,10 +11,11 @@ import torch
 from magnet.datamodules.clip import Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, hashed_split, open_json, require
-from magnet.datamodules.reading.fields import listing, mapping, person, side_by_side
+from magnet.datamodules.reading.fields import listing, person, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
 from magnet.motion.rotations import to_rotvec
+from magnet.unpickle import mapping
 
 SHAPES = {"transl": (3,), "global_orient": (1, 3, 3), "body_pose": (21, 3, 3), "betas": (10,)}
 """Of each key, after (2, T)."""

@@ -15,7 +15,6 @@ from magnet.datamodules.reading.arrays import one_length
 from magnet.datamodules.reading.fields import (
     first_folder,
     listing,
-    mapping,
     natural,
     person,
     pickled_mapping,
@@ -24,6 +23,7 @@ from magnet.datamodules.reading.fields import (
 )
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
+from magnet.unpickle import mapping
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_FOOT, R_HIP,

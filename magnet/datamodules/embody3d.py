@@ -23,10 +23,11 @@ from magnet.datamodules.reading.arrays import (
     open_npy,
     require,
 )
-from magnet.datamodules.reading.fields import PersonMotion, listing, mapping, side_by_side
+from magnet.datamodules.reading.fields import PersonMotion, listing, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.reading.session_split import split_sessions
 from magnet.datamodules.registry import register_data
+from magnet.unpickle import mapping
 
 WIDTHS = {"smplx_mesh_global_orient": 3, "smplx_mesh_body_pose": 63, "smplx_mesh_transl": 3}
 FEATURES = (*WIDTHS, "smplx_mesh_betas", "missing")

@@ -11,9 +11,10 @@ import numpy as np
 from magnet.datamodules.clip import SPLITS, Split
 from magnet.datamodules.prepared import Prepared
 from magnet.datamodules.reading.arrays import AGAIN, OR_YOURS, floats, listed_splits, open_names
-from magnet.datamodules.reading.fields import listing, mapping, natural, person, pickled_mapping, side_by_side
+from magnet.datamodules.reading.fields import listing, natural, person, pickled_mapping, side_by_side
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
+from magnet.unpickle import mapping
 
 RATE = 59.94
 PEOPLE = ("person1", "person2")

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported, without_gaps
-from magnet.datamodules.reading.fields import gender_of, mapping, shape_numbers
+from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
+from magnet.datamodules.reading.fields import gender_of, shape_numbers
 from magnet.datamodules.reading.own import OwnReader, require_alone
 from magnet.datamodules.reading.own_files import PersonFile, SceneFiles
 from magnet.datamodules.reading.recording import DataError, Family, Recording
@@ -20,22 +20,18 @@ from magnet.datamodules.reading.smpl_tracks import PosedTrack, of_one_beginning,
 from magnet.datamodules.registry import register_reader
 from magnet.export.smpl_clock import frame_numbers
 from magnet.export.smpl_keys import (
-    BODY,
-    ORIENT,
     OWN_SHAPE,
     PLACE,
     RATE,
     SCALE,
     SHAPE,
     SMPLX_PELVIS,
-    WHOLE,
     WORLD,
     Unreadable,
-    in_world,
-    posed,
     rotations,
     there_in_world,
 )
+from magnet.export.smpl_people import PERSON, is_posed, one_of, people_in, without_gaps
 from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
 from magnet.unpickle import load_pickle
@@ -44,9 +40,6 @@ WIDTH = 66
 """Numbers of the pelvis and 21 body joints."""
 FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
 """Whose shape numbers go with so many rotation numbers a frame; 66, the body's alone, may be anybody's."""
-PERSON = "name of the person"
-"""Our key for what somebody is called in a dict of people."""
-OPTIONAL = ("gender", SCALE, "body")
 
 
 @register_reader
@@ -97,16 +90,16 @@ class ScenesReader(OwnReader[PosedTrack]):
             held: Any = load_pickle(path)
         else:
             keys = _keys(path)
-            if "meta" in keys and not _posed(dict.fromkeys(keys)):
+            if "meta" in keys and not is_posed(dict.fromkeys(keys)):
                 return _ours(path)
             held = open_npz(path, (), tuple(keys))
-            if len(held) < len(keys) and not any(_posed(one) for one in (held, *held.values())):
+            if len(held) < len(keys) and not any(is_posed(one) for one in (held, *held.values())):
                 pickled = ", ".join(key for key in keys if key not in held)
                 raise DataError(
                     f"{path}: {pickled} holds pickled objects, which are not read in a npz; save a dict or a list of "
                     "people as .pkl, and arrays of one person, or people first, as .npz"
                 )
-        people = list(_people(path, held))
+        people = list(people_in(path, held))
         notes: list[str] = []
         tracks: list[PosedTrack] = []
         names: list[str] = []
@@ -114,9 +107,10 @@ class ScenesReader(OwnReader[PosedTrack]):
             if there_in_world(one):
                 notes.append(f"{' and '.join(WORLD)} are taken, not what the camera sees")
             found = list(self._tracks(where, one, notes))
-            tracks += [
-                replace(track, numbers=frame_numbers(where, one, track.frames, p)) for p, track in enumerate(found)
-            ]
+            lone = alone and len(people) == 1
+            numbers, left = frame_numbers(where, one, found[0].frames, len(found), lone)
+            notes += left
+            tracks += [replace(track, numbers=each) for track, each in zip(found, numbers, strict=True)]
             names += [where if len(found) == 1 else f"{where}, person {p + 1}" for p in range(len(found))]
         tracks, said = on_one_clock(path, tracks, names)
         if len(people) > 1:
@@ -164,7 +158,7 @@ class ScenesReader(OwnReader[PosedTrack]):
                 body=_body_of(held),
                 at_pelvis=own,
                 valid=tracked,
-                gender=gender_of(_one_of(held.get("gender"), p)),
+                gender=gender_of(one_of(held.get("gender"), p)),
             )
 
     def together(self, group: SceneFiles, tracks: list[PosedTrack], notes: list[str]) -> list[PosedTrack]:
@@ -272,35 +266,6 @@ def _ours(path: Path) -> tuple[list[PosedTrack], list[str]]:
     return tracks, notes
 
 
-def _people(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Each person's arrays in a file, which holds one person, a list of people, or a dict of people by name."""
-    if isinstance(held, np.ndarray) and held.dtype == object:
-        held = held.item() if held.ndim == 0 else held.tolist()
-    if isinstance(held, list | tuple):
-        held = {f"person{p + 1}": one for p, one in enumerate(held)}
-    if isinstance(held, Mapping):
-        held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
-    held = mapping(path, held)
-    if _posed(held):
-        yield str(path), in_world(held)
-        return
-    shared = {key: value for key, value in held.items() if key in (*RATE, *OPTIONAL)}
-    inside = {key: value for key, value in held.items() if _posed(value)}
-    if not inside:
-        has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
-        raise DataError(
-            f"{path}: has neither {WHOLE[0]} nor {ORIENT[0]} and {BODY[0]}, alone or for each person; it has {has}; "
-            f"save motion of SMPL's family with these keys, {PLACE[0]}, betas and {RATE[0]}"
-        )
-    for p, (key, value) in enumerate(inside.items()):
-        mine = {shared_key: _one_of(said, p) for shared_key, said in shared.items()}
-        yield f"{path}, {key}", {**mine, PERSON: key, **in_world(mapping(f"{path}, {key}", value))}
-
-
-def _posed(held: Any) -> bool:
-    return isinstance(held, Mapping) and posed(held.keys())
-
-
 def _body_of(held: Mapping[str, Any]) -> str:
     """The body that shape numbers are of, where `magnet.export.npz.save_smplx` says it; others mean something else."""
     return str(held["body"]) if "body" in held and "surface_model_type" in held else ""
@@ -336,12 +301,3 @@ def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:
             f"first{none}; {AGAIN}"
         )
     return whole, whole.shape[-1]
-
-
-def _one_of(value: Any, person: int) -> Any:
-    """A person's entry of a value that a file gives once, or once per person."""
-    return (
-        value[person]
-        if isinstance(value, list | tuple | np.ndarray) and np.ndim(value) == 1 and len(value) > person
-        else value
-    )

@@ -26,8 +26,8 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no BVH, truncated, or a line makes no sense; names file and line. NaN in all frames, or in any
-            that is kept. No such frames.
+        ValueError: no BVH, truncated, or a line makes no sense; names file and line. NaN in all frames that are kept,
+            or, without `gaps`, in any. No such frames.
     """
     path = Path(path)
     try:
@@ -39,9 +39,10 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
     joints, parents = _without_ends(header.joints)
     values, tracked = _motion(path, lines, header)
     kept = kept_frames(path, len(values), start, end)
-    if tracked is not None and not (gaps and tracked.any()):
+    if tracked is not None and not (gaps and tracked[kept].any()):
         _require_finite(path, header.first + 1, tracked, kept)
         tracked = None
+    tracked = None if tracked is None or tracked[kept].all() else tracked[kept]
     offsets = np.array([joint.offset for joint in joints], dtype=np.float64)
     T, K = len(values), len(joints)
     place = np.broadcast_to(offsets, (T, K, 3)).copy()
@@ -62,9 +63,7 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
     names = tuple(joint.name for joint in joints)
     fps = _rate(header.seconds, header.digits)
     # Cut last: where the root is counted from is told by the whole file.
-    return RigMotion(
-        names, parents, offsets, place[kept], local[kept], fps, path, None if tracked is None else tracked[kept]
-    )
+    return RigMotion(names, parents, offsets, place[kept], local[kept], fps, path, tracked)
 
 
 def _placed(offset: Floats, moved: dict[int, Floats], frames: int, reach: float) -> Floats:

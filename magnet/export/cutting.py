@@ -1,4 +1,4 @@
-"""A part of a file's frames, which `--start` and `--end` choose, and files of several clocks or frame rates."""
+"""A part of a file's frames, which `--start` and `--end` choose, and files of several clocks or rates as one scene."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+
+from magnet.motion.resample import resampled
+from magnet.motion.scene import Scene, cat_agents
 
 
-def kept_frames(path: Path, frames: int, start: int, end: int | None) -> slice:
+def kept_frames(path: str | Path, frames: int, start: int, end: int | None) -> slice:
     """The frames of a file that are kept: those from `start` up to `end`, which is not among them; None: all the rest.
 
     Raises:
@@ -27,7 +31,7 @@ def kept_frames(path: Path, frames: int, start: int, end: int | None) -> slice:
     return slice(start, end)
 
 
-def require_one_clock(paths: Sequence[Path], rates: Sequence[float], start: int, end: int | None) -> None:
+def require_one_clock(paths: Sequence[str | Path], rates: Sequence[float], start: int, end: int | None) -> None:
     """Refuse to cut files of different rates by one number of frames, which would be another moment in each.
 
     Raises:
@@ -105,3 +109,49 @@ def rates_note(rates: Sequence[float], fps: float) -> list[str]:
     if len(different) == 1:
         return [f"resampled from {different[0]} to {fps:g} frames a second"]
     return [f"files of {' and '.join(different)} frames a second, all brought to {fps:g}"]
+
+
+def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | None = None, trim: bool = False) -> Scene:
+    """Several people, each a scene with B = 1, as one scene in one world.
+
+    Args:
+        labels: what to call each in errors, such as its file.
+        fps: bring all to this rate; None: they must agree.
+        trim: cut all to the shortest; else lengths must agree.
+
+    Raises:
+        ValueError: rates, lengths or bodies differ.
+    """
+    if fps is not None:
+        people = [resampled(person, fps) for person in people]
+    rates = {person.fps for person in people}
+    if len(rates) > 1:
+        raise ValueError(
+            f"frame rates differ: {_each(labels, [f'{person.fps:g} fps' for person in people])}; "
+            f"bring all to one with magnet export --fps 30, or fps=30 in Python"
+        )
+    bodies = {person.body for person in people}
+    if len(bodies) > 1:
+        raise ValueError(f"bodies differ: {_each(labels, [person.body for person in people])}")
+    shortest = min(person.frames for person in people)
+    if not trim and any(person.frames != shortest for person in people):
+        raise ValueError(
+            f"lengths differ: {_each(labels, [f'{person.frames} frames' for person in people])}; people of one scene "
+            f"share their frames: cut all to the shortest with --trim (trim=True)"
+        )
+    people = [person.slice(0, shortest) for person in people]
+    valid = None
+    if any(person.valid is not None for person in people):
+        all_good = torch.ones(1, shortest, dtype=torch.bool)
+        valid = torch.stack([all_good if p.valid is None else p.valid for p in people]).all(dim=0)
+    given = None
+    if any(person.given is not None for person in people):
+        given = [
+            torch.zeros_like(p.T_world_root[..., 0, 0], dtype=torch.bool) if p.given is None else p.given
+            for p in people
+        ]
+    return cat_agents(people).replace(valid=valid, given=None if given is None else torch.cat(given, dim=2))
+
+
+def _each(labels: Sequence[str], what: Sequence[str]) -> str:
+    return ", ".join(f"{label} {value}" for label, value in zip(labels, what, strict=True))

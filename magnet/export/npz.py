@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
@@ -26,6 +28,7 @@ from magnet.export.smpl_keys import (
     in_world,
     rotations,
 )
+from magnet.export.smpl_people import without_gaps
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
 from magnet.files import DAMAGED, load_npz, save_npz, suffixed
 from magnet.motion.frames import rigid
@@ -33,6 +36,8 @@ from magnet.motion.required import require_body, require_one
 from magnet.motion.rotations import from_rotvec, to_rotvec
 from magnet.motion.scene import BODY_JOINTS, Scene
 
+_Held = tuple[dict[str, Tensor], float, str | None, str]
+"""Arrays by our keys, frames a second, the body that a file was written for if it says so, and its name."""
 SMPLX_JOINTS = 55
 STANDING, LYING = (0.4, 1.4), 0.15
 """Metres of a pelvis over the floor: of who stands or sits, and at least."""
@@ -122,15 +127,42 @@ def load_smplx(path: str | Path, body: Body, up: str | None = None) -> Scene:
 def read_smplx(
     path: str | Path, body: Body, up: str | None = None, unit: str | None = None, in_fps: float | None = None
 ) -> tuple[Scene, str]:
-    """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several.
+    """Read a SMPL-X style npz, of `save_smplx` or of other tools, one person or several, as `scene_of` does.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a damaged file, or as `scene_of`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        with load_npz(path) as archive:
+            arrays = _arrays(path, archive, in_fps)
+    except (OSError, *DAMAGED) as error:
+        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
+    return _scene_of(path, arrays, body, up, unit)
+
+
+def scene_of(
+    where: str | Path,
+    held: Mapping[str, Any],
+    body: Body,
+    up: str | None = None,
+    unit: str | None = None,
+    in_fps: float | None = None,
+) -> tuple[Scene, str]:
+    """Arrays under the keys of SMPL's family as a scene, of one person or of several along the first axis.
 
     Also read: every name that `magnet.export.smpl_keys` knows (`trans`, `root_orient` and `pose_body`,
     `global_orient` and `body_pose`, ...), rotations as matrices or joint by joint, more or fewer than ten betas (the
     first ten count; the median where a person has several rows), no betas (zero). A file that does not name its body
     is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise, with SMPL-X's mean J0.
+    Frames of somebody that hold NaN hold the pose before, and are not valid.
 
     Args:
-        path: the file.
+        where: the file, and whose numbers they are, for messages.
+        held: arrays, or what numpy makes arrays of; None counts as absent.
         body: whose shapes the scene will have.
         up: axis of the file that points up, one of `magnet.export.rig.UP`. None: y in files of ours, in others the
             axis along which pelvises stand.
@@ -141,15 +173,19 @@ def read_smplx(
         The scene, B = 1, float32; and the axis of the file that points up.
 
     Raises:
-        FileNotFoundError: there is no such file.
         ValueError: no such file's keys or shapes, or another body's; no such unit, or another one than is said; no
-            frame rate, or another one than is said; turns in degrees.
+            frame rate, or another one than is said; turns in degrees; nobody tracked in any frame.
     """
+    there = {key: value for key, value in held.items() if value is not None}
+    return _scene_of(where, _arrays(where, there, in_fps), body, up, unit)
+
+
+def _scene_of(where: str | Path, read: _Held, body: Body, up: str | None, unit: str | None) -> tuple[Scene, str]:
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
-    arrays, fps, written_for, name = _read(Path(path), in_fps)
+    arrays, fps, written_for, name = read
     if written_for is not None and written_for != body.id:
-        raise ValueError(f"{path}: written for body {written_for!r}, but {body.id!r} was given")
+        raise ValueError(f"{where}: written for body {written_for!r}, but {body.id!r} was given")
     poses, transl, betas = arrays["poses"], arrays["transl"], arrays.get(OWN_SHAPE, arrays["betas"])
     of_smplx = OWN_SHAPE in arrays or (written_for is None and is_open(body))  # transl is, betas are not
     if poses.ndim == 2:
@@ -160,12 +196,13 @@ def read_smplx(
     fits = poses.ndim == 3 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
     if not fits or betas.ndim != 2 or len(betas) != P:
         shapes = f"poses {tuple(poses.shape)}, transl {tuple(transl.shape)}, betas {tuple(betas.shape)}"
-        raise ValueError(f"{path}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10)")
+        raise ValueError(f"{where}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10)")
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
+    poses, transl, valid = _without_gaps(where, poses[..., : 3 * BODY_JOINTS], transl)
     if written_for is None and is_open(body):
         betas = torch.zeros_like(betas)
-    _require_radians(path, poses)
-    turned = from_rotvec(poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)))
+    _require_radians(where, poses)
+    turned = from_rotvec(poses.unflatten(-1, (BODY_JOINTS, 3)))
     rest_pelvis = _smplx_pelvis(transl) if of_smplx else body.rest_joints(betas.float())[:, 0].double()
     pelvis = transl * UNITS[unit or "m"] + rest_pelvis[:, None]
     T_world_root = rigid(turned[:, :, 0], pelvis)
@@ -175,7 +212,7 @@ def read_smplx(
         raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
     T_world_root = T_world_root.new_tensor(np.block([[UP[up], np.zeros((3, 1))], [np.eye(4)[3:]]])) @ T_world_root
     if unit is None:
-        _require_metres(path, T_world_root)
+        _require_metres(where, T_world_root)
     scene = Scene(
         body_rot=turned[:, :, 1:].transpose(0, 1)[None].float(),
         T_world_root=T_world_root.transpose(0, 1)[None].float(),
@@ -183,28 +220,46 @@ def read_smplx(
         present=torch.ones(1, P, dtype=torch.bool),
         fps=fps,
         body=body.id,
+        valid=valid,
         names=(name,) if name else (),
         given=None if "given" not in arrays else arrays["given"].view(P, T).T[None],
     )
     return scene, up
 
 
-def _require_radians(path: str | Path, poses: Tensor) -> None:
-    """Refuse turns that nobody writes in radians, where half a turn is pi. poses (P, T, 66 or more)"""
-    turn = poses[..., : 3 * BODY_JOINTS].unflatten(-1, (BODY_JOINTS, 3)).norm(dim=-1).nan_to_num()
+def _without_gaps(where: str | Path, poses: Tensor, transl: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Numbers of frames that hold NaN as in the frame before; and (1, T) whether everybody was tracked, None: always.
+
+    poses (P, T, 66), transl (P, T, 3) -> the same
+    """
+    if not poses.numel():
+        return poses, transl, None
+    filled, tracked = [], []
+    for p, parts in enumerate(zip(poses.numpy(), transl.numpy(), strict=True)):
+        whole, there, _ = without_gaps(where if len(poses) == 1 else f"{where}, person {p + 1}", *parts)
+        filled.append([torch.from_numpy(part) for part in whole])
+        tracked.append(torch.from_numpy(there))
+    valid = torch.stack(tracked).all(dim=0)
+    poses, transl = (torch.stack(parts) for parts in zip(*filled, strict=True))
+    return poses, transl, None if bool(valid.all()) else valid[None]
+
+
+def _require_radians(where: str | Path, poses: Tensor) -> None:
+    """Refuse turns that nobody writes in radians, where half a turn is pi. poses (P, T, 66)"""
+    turn = poses.unflatten(-1, (BODY_JOINTS, 3)).norm(dim=-1)
     if (turn > MOST_TURNED).any(dim=-1).float().mean() > 0.5:
-        raise ValueError(f"{path}: poses: turns of up to {float(turn.max()):.0f} radians; degrees? Divide by 180 / pi")
+        raise ValueError(f"{where}: poses: turns of up to {float(turn.max()):.0f} radians; degrees? Divide by 180 / pi")
 
 
-def _require_metres(path: str | Path, T_world_root: Tensor) -> None:
+def _require_metres(where: str | Path, T_world_root: Tensor) -> None:
     """Refuse pelvises so high that their unit is another. (P, T, 4, 4) in the world"""
     if not T_world_root.numel():
         return
-    height = float(T_world_root[..., 1, 3].nan_to_num().median(dim=1).values.abs().max())
+    height = float(T_world_root[..., 1, 3].median(dim=1).values.abs().max())
     if height > HIGHEST:
         raise ValueError(
-            f"{path}: pelvises are {height:.0f} m over or under the floor; say the unit of lengths: --in_unit cm or mm "
-            "(unit=...), or m if they are"
+            f"{where}: pelvises are {height:.0f} m over or under the floor; say the unit of lengths: --in_unit cm or "
+            "mm (unit=...), or m if they are"
         )
 
 
@@ -245,50 +300,53 @@ def unit_against(scenes: Sequence[Scene], unit: str) -> list[str]:
     return []
 
 
-def _number(path: Path, key: str, file: Mapping[str, np.ndarray], what: str) -> float:
+def _numbers(where: str | Path, held: Mapping[str, Any], key: str) -> NDArray[Any]:
+    """An array of numbers."""
+    try:
+        array = np.asarray(held[key])
+    except ValueError as error:  # rows of unequal length, or pickled in a npz
+        raise ValueError(f"{where}: {key}: expected an array of numbers ({error})") from error
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{where}: {key}: holds {array.dtype}, expected finite numbers")
+    return array
+
+
+def _number(where: str | Path, key: str, held: Mapping[str, Any], what: str) -> float:
     """A number, which some programs write as an array of one."""
     try:
-        (number,) = np.ravel(file[key]).tolist()
+        (number,) = np.ravel(held[key]).tolist()
         return float(number)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {key}: expected one number, {what}") from error
+        raise ValueError(f"{where}: {key}: expected one number, {what}") from error
 
 
-def _read(path: Path, in_fps: float | None) -> tuple[dict[str, Tensor], float, str | None, str]:
-    """Arrays by our keys, frames a second, the body that the file was written for if it says so, and its name."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        with load_npz(path) as archive:
-            file = in_world(archive)
-            there = set(file)
-            ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
-            _require_keys(path, there, ours, in_fps)
-            poses, transl = rotations(path, file), file[first_of(("transl", *PLACE), there) or ""]
-            if SCALE in there:
-                transl = transl / _number(path, SCALE, file, "by which translations are divided")
-            fps, shape = _rate(path, file, in_fps), first_of(SHAPE, there)
-            betas = np.zeros((*poses.shape[:-2], 10)) if shape is None else file[shape]
-            written_for = str(file["body"]) if ours else None
-            name = str(file["name"]) if "name" in there else ""
-            own = file[OWN_SHAPE] if written_for is not None and OWN_SHAPE in there else None
-            given = file["given"] if written_for is not None and "given" in there else None
-    except (OSError, *DAMAGED) as error:
-        raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
-    arrays = {"poses": poses, "transl": transl, "betas": betas} | ({} if own is None else {OWN_SHAPE: own})
-    bad = [name for name, array in arrays.items() if array.dtype.kind not in "iuf" or not np.isfinite(array).all()]
+def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> _Held:
+    held = in_world(held)
+    there = set(held)
+    ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
+    _require_keys(where, there, ours, in_fps)
+    place, shape = first_of(("transl", *PLACE), there) or "", first_of(SHAPE, there)
+    arrays = {"poses": rotations(where, held), "transl": _numbers(where, held, place)}
+    arrays["betas"] = np.zeros((*arrays["poses"].shape[:-2], 10)) if shape is None else _numbers(where, held, shape)
+    if ours and OWN_SHAPE in there:
+        arrays[OWN_SHAPE] = _numbers(where, held, OWN_SHAPE)
+    if SCALE in there:
+        arrays["transl"] = arrays["transl"] / _number(where, SCALE, held, "by which translations are divided")
+    fps = _rate(where, held, in_fps)
+    bad = [name for name, array in arrays.items() if name in ("betas", OWN_SHAPE) and not np.isfinite(array).all()]
     if bad or not 0 < fps < float("inf"):
-        cut = "; cut frames without them out, as magnet data prepare does" if bad else ""
-        raise ValueError(f"{path}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers{cut}")
+        raise ValueError(f"{where}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
     tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
-    if given is not None:
-        if given.dtype != bool or given.shape != poses.shape[:-1]:
-            raise ValueError(f"{path}: given: got {given.dtype} {given.shape}, expected bool {poses.shape[:-1]}")
+    if ours and "given" in there:
+        given, expected = held["given"], arrays["poses"].shape[:-1]
+        if given.dtype != bool or given.shape != expected:
+            raise ValueError(f"{where}: given: got {given.dtype} {given.shape}, expected bool {expected}")
         tensors["given"] = torch.from_numpy(given)
-    return tensors, fps, written_for, name
+    written_for = str(held["body"]) if ours else None
+    return tensors, fps, written_for, str(held["name"]) if "name" in there else ""
 
 
-def _require_keys(path: Path, there: Collection[str], ours: bool, in_fps: float | None) -> None:
+def _require_keys(where: str | Path, there: Collection[str], ours: bool, in_fps: float | None) -> None:
     """Refuse a file without motion or rate, by our names of what is missing."""
     whole = first_of(WHOLE, there) or (first_of(ORIENT, there) and first_of(BODY, there))
     unrated = in_fps is None and not first_of(RATE, there)
@@ -299,15 +357,15 @@ def _require_keys(path: Path, there: Collection[str], ours: bool, in_fps: float 
         fix = "; say the frames a second: --in_fps 30 (in_fps=30)" if unrated else ""
         if not whole and not first_of(PLACE, there):
             fix = "; positions of joints are read from a table, .csv (docs/export.md)" + fix
-        raise ValueError(f"{path}: lacks {', '.join(missing)}; it has {', '.join(sorted(there))}{fix}")
+        raise ValueError(f"{where}: lacks {', '.join(missing)}; it has {', '.join(sorted(there))}{fix}")
 
 
-def _rate(path: Path, file: Mapping[str, np.ndarray], in_fps: float | None) -> float:
+def _rate(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> float:
     """Frames a second, of the file or, where it says nothing, as given."""
-    key = first_of(RATE, file.keys())
-    fps = in_fps if key is None else _number(path, key, file, "frames a second")
+    key = first_of(RATE, held.keys())
+    fps = in_fps if key is None else _number(where, key, held, "frames a second")
     assert fps is not None  # `_require_keys`
-    require_own_rate(path, fps, in_fps)
+    require_own_rate(where, fps, in_fps)
     return fps
 
 

@@ -1,35 +1,53 @@
-"""Scenes from npz files, of magnet or of other programs, a file a person or one for all."""
+"""Scenes from npz and pkl files, of magnet or of other programs, a file a person or one for all."""
 
 from __future__ import annotations
 
 import contextlib
 import zipfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from magnet.body import Body
 from magnet.export.cutting import kept_frames, require_one_clock
-from magnet.export.npz import clear_axes, is_open, read_smplx, require_own_rate, stance_in, unit_against
+from magnet.export.npz import clear_axes, is_open, read_smplx, require_own_rate, scene_of, stance_in, unit_against
+from magnet.export.rig import UP
 from magnet.export.smpl_clock import FRAMES, Numbers, SharedClock, frame_numbers, require_one_beginning, shared_clock
 from magnet.export.smpl_keys import posed
-from magnet.export.upright import agreed, said, told_against
+from magnet.export.smpl_people import HELD, gap_note, people_in
+from magnet.export.upright import agreed, axis_of, said, told_against
 from magnet.files import load_npz
 from magnet.motion.scene import Scene
+from magnet.unpickle import load_pickle
+
+PICKLE = ".pkl"
 
 
 @dataclass(frozen=True)
 class NpzFile:
     """A scene of ours or SMPL-X's keys, told apart by what they hold."""
 
+    where: str  # the file, and who of it
     scene: Scene
     notes: list[str]
     foreign: bool  # another program wrote it
     up: str  # axis of the file
     numbers: tuple[Numbers | None, ...] = ()  # of each person's frames, where another program's file has them
+
+    @property
+    def name(self) -> str:
+        """The file's name, and who of it."""
+        return Path(self.where).name
+
+    def upright(self, up: str) -> NpzFile:
+        """The same where another axis of the file points up."""
+        turn = torch.eye(4, dtype=torch.float64)
+        turn[:3, :3] = torch.from_numpy(UP[up] @ UP[self.up].T)  # of whole numbers, so nothing is rounded
+        return replace(self, up=up, scene=self.scene.replace(T_world_root=turn.float() @ self.scene.T_world_root))
 
 
 def is_ours(path: Path) -> bool:
@@ -54,7 +72,7 @@ def read_people(
     start: int = 0,
     end: int | None = None,
 ) -> list[NpzFile]:
-    """Read the npz files of one scene, other programs' with the axis that suits them together.
+    """Read the npz and pkl files of one scene, other programs' with the axis that suits them together.
 
     People whose frames are numbered are laid on each other by these, as `magnet data prepare` does; frames in which
     somebody was not seen hold who was seen before, and are not valid.
@@ -64,19 +82,23 @@ def read_people(
         body, up, unit, in_fps: as in `magnet.export.npz.read_smplx`.
         start, end: the frames that are read, from 0, without `end`; None: to the last.
 
+    Returns:
+        Of each file everybody, or, where a pkl holds people by name, each of them.
+
     Raises:
         ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts; no such
             frames, or numbers of frames that do not go together.
     """
-    people = [_read(file, body, up, unit, in_fps) for file in files]
+    alone = len(files) == 1
+    people = [one for file in files for one in _read(file, body, up, unit, in_fps, alone)]
     if up is None and len(people) > 1:
-        people = _of_one_axis(files, people, body, unit, in_fps)
+        people = _of_one_axis(people, body)
     warned = told_against(up, [axis for one in people for axis in clear_axes(one.scene, up)]) if up else []
     warned += unit_against([one.scene for one in people], unit) if unit else []
     people = [replace(people[0], notes=[*people[0].notes, *warned]), *people[1:]] if warned else people
-    require_one_clock(files, [one.scene.fps for one in people], start, end)
+    require_one_clock([one.where for one in people], [one.scene.fps for one in people], start, end)
     # Cut last: the whole file tells which way is up.
-    kept = [kept_frames(file, one.scene.frames, start, end) for file, one in zip(files, people, strict=True)]
+    kept = [kept_frames(one.where, one.scene.frames, start, end) for one in people]
     people = [
         replace(
             one,
@@ -85,22 +107,22 @@ def read_people(
         )
         for one, part in zip(people, kept, strict=True)
     ]
-    return _on_one_clock(files, people)
+    return _on_one_clock(people)
 
 
-def _on_one_clock(files: Sequence[Path], people: Sequence[NpzFile]) -> list[NpzFile]:
+def _on_one_clock(people: Sequence[NpzFile]) -> list[NpzFile]:
     """Files with everybody at their moments, where numbers of frames tell these."""
     numbers: list[Numbers | None] = []
     names: list[str] = []
-    for file, one in zip(files, people, strict=True):
+    for one in people:
         alone = len(one.numbers) == 1
         numbers += one.numbers
-        names += [file.name if alone else f"{file.name}, person {p + 1}" for p in range(len(one.numbers))]
+        names += [one.name if alone else f"{one.name}, person {p + 1}" for p in range(len(one.numbers))]
     if len({one.scene.fps for one in people}) > 1:
-        begun = {file.name: _first(one) for file, one in zip(files, people, strict=True)}
-        require_one_beginning(files[0], begun, "cut each alone to one beginning: magnet export --start")
-        return list(people)
-    clock = shared_clock(files[0], numbers, names, "they hold the pose before, and are not valid")
+        begun = {one.name: _first(one) for one in people}
+        require_one_beginning(people[0].where, begun, "cut each alone to one beginning: magnet export --start")
+        return [each for one in people for each in _on_one_clock([one])]
+    clock = shared_clock(people[0].where, numbers, names, HELD)
     if clock is None:
         return list(people)
     found, first = [], 0
@@ -120,6 +142,8 @@ def _at(scene: Scene, clock: SharedClock, people: slice) -> Scene:
     """A file's people at the frames of a clock. people: which of the clock's they are"""
     at = torch.from_numpy(np.stack(clock.at[people], axis=1))  # (T, P)
     seen = torch.from_numpy(np.stack(clock.seen[people], axis=1)).all(dim=1)
+    if scene.valid is not None:
+        seen &= scene.valid[0, at].all(dim=1)
     person = torch.arange(scene.agents)
     return scene.replace(
         body_rot=scene.body_rot[:, at, person],
@@ -129,23 +153,27 @@ def _at(scene: Scene, clock: SharedClock, people: slice) -> Scene:
     )
 
 
-def _of_one_axis(
-    files: Sequence[Path], people: Sequence[NpzFile], body: Body, unit: str | None, in_fps: float | None
-) -> list[NpzFile]:
-    """Somebody may lie in one of the files: then it is read again with the axis of the others."""
+def _of_one_axis(people: Sequence[NpzFile], body: Body) -> list[NpzFile]:
+    """People of several files with the axis that suits them together: somebody may lie."""
     if len({one.up for one in people}) == 1 or any(one.scene.scenes != 1 for one in people):
         return list(people)
     stances = [stance_in(one.scene, body, one.up, not one.foreign) for one in people]
     ups = agreed(stances)
-    read = []
-    for k, (file, one) in enumerate(zip(files, people, strict=True)):
-        again = one if ups[k] == one.up else _read(file, body, ups[k], unit, in_fps)
-        read.append(replace(again, notes=[*again.notes, *(f"{file.name}: {note}" for note in said(stances, ups, k))]))
-    return read
+    turned = [one if one.up == up else one.upright(up) for one, up in zip(people, ups, strict=True)]
+    return [
+        replace(one, notes=[*one.notes, *(f"{one.name}: {note}" for note in said(stances, ups, k))])
+        for k, one in enumerate(turned)
+    ]
 
 
-def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None) -> NpzFile:
-    """A scene of ours or SMPL-X's keys, and how it was read."""
+def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None, alone: bool) -> list[NpzFile]:
+    """What a file holds, and how it was read. alone: no other file is of the scene"""
+    if path.suffix.lower() == PICKLE:
+        there = list(people_in(path, load_pickle(path)))
+        read = [_foreign(where, one, scene_of(where, one, body, up, unit, in_fps), body, up) for where, one in there]
+        if up is None:
+            read = _of_one_world(read)
+        return [_numbered(one, held, alone and len(there) == 1) for one, (_, held) in zip(read, there, strict=True)]
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a readable npz (no archive, or cut short); copy or download it again")
     try:
@@ -154,35 +182,54 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     if _ours(keys):
-        if up not in (None, "y"):
-            raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
-        if unit not in (None, "m"):
-            raise ValueError(
-                f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres"
-            )
-        scene = Scene.load(path)
-        require_own_rate(path, scene.fps, in_fps)
-        if scene.body != body.id:
-            raise ValueError(
-                f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body FILE"
-            )
-        return NpzFile(scene, [], False, "y", (None,) * scene.agents)
-    scene, found = read_smplx(path, body, up, unit, in_fps)
-    note, ours = [], {"body", "surface_model_type"} <= keys
-    if up is None and found not in ("y", "z"):
-        note.append(f"{path.name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
-    if not ours and is_open(body):
-        note.append(
-            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body FILE "
-            "names theirs"
-        )
-    return NpzFile(scene, note, not ours, found, _numbers(path, keys, scene))
-
-
-def _numbers(path: Path, keys: Collection[str], scene: Scene) -> tuple[Numbers | None, ...]:
-    """The numbers of each person's frames, where a file has them."""
+        return [_own(path, body, up, unit, in_fps)]
+    one = _foreign(str(path), keys, read_smplx(path, body, up, unit, in_fps), body, up)
     held = {}
     if FRAMES in keys:
         with load_npz(path) as file, contextlib.suppress(ValueError):  # pickled, such as names of pictures
             held = {FRAMES: file[FRAMES]}
-    return tuple(frame_numbers(path, held, scene.frames, p) for p in range(scene.agents))
+    return [_numbered(one, held, alone)]
+
+
+def _own(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None) -> NpzFile:
+    """A scene as we save it."""
+    if up not in (None, "y"):
+        raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
+    if unit not in (None, "m"):
+        raise ValueError(f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres")
+    scene = Scene.load(path)
+    require_own_rate(path, scene.fps, in_fps)
+    if scene.body != body.id:
+        raise ValueError(
+            f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body FILE"
+        )
+    return NpzFile(str(path), scene, [], False, "y", (None,) * scene.agents)
+
+
+def _foreign(where: str, keys: Collection[str], read: tuple[Scene, str], body: Body, up: str | None) -> NpzFile:
+    """A scene under SMPL-X's keys, and what should be known of it. up: as it was asked for"""
+    (scene, found), name, notes = read, Path(where).name, list[str]()
+    ours = {"body", "surface_model_type"} <= set(keys)
+    if scene.valid is not None:
+        notes += gap_note(name, scene.valid[0].numpy(), HELD)
+    if up is None and found not in ("y", "z"):
+        notes.append(f"{name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
+    if not ours and is_open(body):
+        notes.append(
+            f"{name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body FILE "
+            "names theirs"
+        )
+    return NpzFile(where, scene, notes, not ours, found)
+
+
+def _of_one_world(people: Sequence[NpzFile]) -> list[NpzFile]:
+    """People of one file, who share their world and so the axis along which most of them stand."""
+    torsos = [one.scene.T_world_root[0, ..., :3, 1].double().mean(dim=(0, 1)).numpy() @ UP[one.up] for one in people]
+    up = axis_of(np.mean(torsos, axis=0))
+    return [one if one.up == up else one.upright(up) for one in people]
+
+
+def _numbered(one: NpzFile, held: Mapping[str, Any], alone: bool) -> NpzFile:
+    """With the numbers of each person's frames, where a file has them. alone: nobody else is in the scene"""
+    numbers, notes = frame_numbers(one.where, held, one.scene.frames, one.scene.agents, alone)
+    return replace(one, numbers=numbers, notes=[*one.notes, *notes])

@@ -11,12 +11,12 @@ from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.body.joints import HIPS
 from magnet.checks import require_flag, require_number, require_whole
-from magnet.export.cutting import rates_note, shared_frames
+from magnet.export.cutting import rates_note, shared_frames, together
 from magnet.export.formats import MOST_FPS, WRITTEN
 from magnet.export.gltf_file import GLTF
 from magnet.export.joints_read import load_joints
-from magnet.export.npz_files import is_ours, read_people
-from magnet.export.retarget import load_rigs, together
+from magnet.export.npz_files import PICKLE, is_ours, read_people
+from magnet.export.retarget import load_rigs
 from magnet.export.rig_files import RIGS
 from magnet.export.unread import advice_for
 from magnet.export.upright import WARNING
@@ -26,7 +26,8 @@ from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
 
 TABLE = ".csv"
-READ = (".npz", *RIGS, TABLE)
+ARRAYS = (".npz", PICKLE)
+READ = (*ARRAYS, *RIGS, TABLE)
 """Suffixes that can be read."""
 UNSEEN = 0.0005
 """Metres by which people are moved without a word."""
@@ -52,11 +53,11 @@ class Reading:
     Args:
         fps: resample to this rate; None: as recorded.
         trim: cut people of different lengths to the shortest.
-        unit: of lengths; None: of an npz metres, else by the length of legs.
+        unit: of lengths; None: of npz and pkl metres, else by the length of legs.
         up: axis of the file that points up; None: found.
-        joints: for all but npz: our joint's name to the file's, if no naming scheme fits.
+        joints: for all but npz and pkl: our joint's name to the file's, if no naming scheme fits.
         keep_floor: keep people of other programs' files at the height they were recorded at.
-        in_fps: frames a second of npz and csv files that do not say it.
+        in_fps: frames a second of npz, pkl and csv files that do not say it.
         start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
         clip: the animation of GLB files that is read, by its name; None: the first that moves somebody.
     """
@@ -91,7 +92,7 @@ class Reading:
 def read(
     paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
 ) -> Read:
-    """Read a scene from a Scene npz, or from SMPL-X npz, BVH, GLB, FBX or CSV files; several files are several people.
+    """Read a scene from a Scene npz, or SMPL's npz and pkl, BVH, GLB, FBX or CSV files; several are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
@@ -103,14 +104,14 @@ def read(
     files = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     options = options or Reading()
     suffixes = {file.suffix.lower() for file in files}
-    if not suffixes or not (suffixes in ({".npz"}, {TABLE}) or suffixes <= set(RIGS)):
+    if not suffixes or not (suffixes <= set(ARRAYS) or suffixes == {TABLE} or suffixes <= set(RIGS)):
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
         also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
         rigs = ", ".join(RIGS)
         raise ValueError(
-            f"cannot read {names}: expected .npz or {TABLE} files alone, or files of skeletons ({rigs}){only}"
-            f"{advice_for(suffixes)}"
+            f"cannot read {names}: expected {' and '.join(ARRAYS)}, or {TABLE} files alone, or files of skeletons "
+            f"({rigs}){only}{advice_for(suffixes)}"
         )
     for file in files:
         if not file.exists():
@@ -120,7 +121,7 @@ def read(
     if suffixes <= set(RIGS):
         if options.in_fps is not None:
             said = f"a {min(suffixes)} says its own, --fps resamples"
-            raise ValueError(f"in_fps: is for .npz and {TABLE} files that say no frame rate; {said}")
+            raise ValueError(f"in_fps: is for {', '.join((*ARRAYS, TABLE))} files that say no frame rate; {said}")
         told = {name: value for name, value in vars(options).items() if name != "in_fps"}
         imported = load_rigs(files, body, **told)
         notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
@@ -133,8 +134,9 @@ def read(
     if suffixes == {TABLE}:
         return _from_tables(files, body, options)
     if options.joints:
+        kinds = ", ".join((*RIGS, TABLE))
         raise ValueError(
-            f"{files[0]}: joint: is for {', '.join((*RIGS, TABLE))}; in an .npz joints are where SMPL-X has them"
+            f"{files[0]}: joint: is for {kinds}; in an {files[0].suffix.lower()} joints are where SMPL-X has them"
         )
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
@@ -143,11 +145,12 @@ def read(
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
         notes += rates_note([scenes[0].fps], scene.fps)
         return _grounded(scene, body, notes, () if options.keep_floor else foreign)
-    for file, scene in zip(files, scenes, strict=True):
-        if scene.scenes != 1:
-            raise ValueError(f"{file}: holds {scene.scenes} scenes; several files are several people of one scene")
-    labels = [str(file) for file in files]
-    scene = together(scenes, labels, fps=options.fps, trim=options.trim)
+    for one in people:
+        if one.scene.scenes != 1:
+            raise ValueError(
+                f"{one.where}: holds {one.scene.scenes} scenes; several files are several people of one scene"
+            )
+    scene = together(scenes, [one.where for one in people], fps=options.fps, trim=options.trim)
     notes += rates_note([one.fps for one in scenes], scene.fps)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
 

@@ -22,12 +22,12 @@ from magnet.body.joints import (  # isort: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
-from magnet.export.cutting import require_one_clock
+from magnet.export.cutting import require_one_clock, together
 from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, people_of, understood_together
 from magnet.export.rig_files import read_rigs
+from magnet.export.rig_motion import RigMotion
 from magnet.motion.frames import rigid
-from magnet.motion.resample import resampled
-from magnet.motion.scene import BODY_JOINTS, Scene, cat_agents
+from magnet.motion.scene import BODY_JOINTS, Scene
 
 Floats = NDArray[np.float64]
 
@@ -164,8 +164,8 @@ def load_rigs(
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
     sources = tuple(replace(how, jumps=found) for (_, how), found in zip(read, jumps, strict=True))
-    labels = [f"{file.path} {file.person}".rstrip() for file in files]
-    scene = together([scene for scene, _ in read], labels, fps=fps, trim=trim)
+    people = [_tracked(one, file) for (one, _), file in zip(read, files, strict=True)]
+    scene = together(people, [f"{file.path} {file.person}".rstrip() for file in files], fps=fps, trim=trim)
     floor = 0.0
     if not keep_floor and not all(source.exact for _, source in read):
         floor = float(floor_height(body.joints(scene)[0], body, scene.betas[0]).amin(dim=-1).median())
@@ -174,6 +174,11 @@ def load_rigs(
         scene = scene.replace(T_world_root=T_world_root)
     named = scene.replace(names=(" + ".join(path.stem for path in each),))
     return Imported(named, sources, floor, tuple(file.fps for file in files))
+
+
+def _tracked(scene: Scene, file: RigMotion) -> Scene:
+    """One person's scene, in which frames that the file lacks are not valid."""
+    return scene.replace(valid=None if file.tracked is None else torch.from_numpy(file.tracked)[None])
 
 
 def onto(
@@ -351,49 +356,3 @@ def _spine(bones: int) -> tuple[list[int], list[int]]:
     if last == 2:
         return [PELVIS, SPINE1, SPINE3], [0, 1, 2]
     return list(SPINE), [0, 1, (1 + last) // 2, last]
-
-
-def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | None = None, trim: bool = False) -> Scene:
-    """Several people, each a scene with B = 1, as one scene in one world.
-
-    Args:
-        labels: what to call each in errors, such as its file.
-        fps: bring all to this rate; None: they must agree.
-        trim: cut all to the shortest; else lengths must agree.
-
-    Raises:
-        ValueError: rates, lengths or bodies differ.
-    """
-    if fps is not None:
-        people = [resampled(person, fps) for person in people]
-    rates = {person.fps for person in people}
-    if len(rates) > 1:
-        raise ValueError(
-            f"frame rates differ: {_each(labels, [f'{person.fps:g} fps' for person in people])}; "
-            f"bring all to one with magnet export --fps 30, or fps=30 in Python"
-        )
-    bodies = {person.body for person in people}
-    if len(bodies) > 1:
-        raise ValueError(f"bodies differ: {_each(labels, [person.body for person in people])}")
-    shortest = min(person.frames for person in people)
-    if not trim and any(person.frames != shortest for person in people):
-        raise ValueError(
-            f"lengths differ: {_each(labels, [f'{person.frames} frames' for person in people])}; people of one scene "
-            f"share their frames: cut all to the shortest with --trim (trim=True)"
-        )
-    people = [person.slice(0, shortest) for person in people]
-    valid = None
-    if any(person.valid is not None for person in people):
-        all_good = torch.ones(1, shortest, dtype=torch.bool)
-        valid = torch.stack([all_good if p.valid is None else p.valid for p in people]).all(dim=0)
-    given = None
-    if any(person.given is not None for person in people):
-        given = [
-            torch.zeros_like(p.T_world_root[..., 0, 0], dtype=torch.bool) if p.given is None else p.given
-            for p in people
-        ]
-    return cat_agents(people).replace(valid=valid, given=None if given is None else torch.cat(given, dim=2))
-
-
-def _each(labels: Sequence[str], what: Sequence[str]) -> str:
-    return ", ".join(f"{label} {value}" for label, value in zip(labels, what, strict=True))

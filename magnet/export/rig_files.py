@@ -14,6 +14,7 @@ from magnet.export.fbx import converted
 from magnet.export.glb_read import read_glb
 from magnet.export.gltf_file import GLTF
 from magnet.export.rig_motion import RigMotion
+from magnet.export.smpl_people import HELD, gap_note
 from magnet.files import regular
 
 
@@ -39,7 +40,9 @@ def read_rigs(path: str | Path, start: int = 0, end: int | None = None, clip: st
 
 
 def _bvh(path: Path, start: int, end: int | None) -> list[RigMotion]:
-    return [read_bvh(path, start=start, end=end)]
+    file = read_bvh(path, True, start, end)
+    lost = () if file.tracked is None else gap_note(file.path.name, file.tracked, HELD)
+    return [replace(file, notes=(*file.notes, *lost))]
 
 
 def _fbx(path: Path, start: int, end: int | None) -> list[RigMotion]:

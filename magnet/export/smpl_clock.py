@@ -17,39 +17,56 @@ FRAMES = "frame_ids"
 """Under which trackers say which frames of a video somebody was seen in."""
 LONGEST = 1_000_000
 """Frames between the first and the last one of a file that are believed: nine hours at 30 a second."""
+MEND = "; mend them, or leave them out"
 
 
-def frame_numbers(where: object, held: Mapping[str, Any], frames: int, person: int) -> Numbers | None:
-    """Which frames of a video a person's frames are, (T,); None: the file does not say, or not by numbers.
+def frame_numbers(
+    where: object, held: Mapping[str, Any], frames: int, people: int, alone: bool = False
+) -> tuple[tuple[Numbers | None, ...], tuple[str, ...]]:
+    """Which frames of a video the frames of each of P people are.
 
     Args:
         where: for messages.
         held: what the file has of one person, or of several along the first axis.
         frames: T.
-        person: which of several.
+        people: P.
+        alone: nobody else is in the scene, so that one person does not need them.
+
+    Returns:
+        Of each person (T,), or None where the file does not say, or not by numbers; and a note where one person alone
+        has some that cannot be used.
 
     Raises:
         DataError: not one whole number a frame, or they do not rise.
     """
     value = np.asarray(held.get(FRAMES))
     if value.dtype.kind not in "iuf" or not value.size:  # names of pictures, say
-        return None
+        return (None,) * people, ()
     if value.shape == (frames, 1):
-        value = value[:, 0]
-    each = value.ndim == 2 and (len(value) == 1 or person < len(value))
-    given = value[person if len(value) > 1 else 0] if each else value
-    if given.shape != (frames,):
-        raise DataError(
-            f"{where}: {FRAMES}: got shape {given.shape}, expected {(frames,)}, a number a frame; mend them, or leave "
-            "them out"
-        )
+        value = value.T
+    try:
+        if value.shape not in ((frames,), (1, frames), (people, frames)):
+            several = f", or {(people, frames)} for {people} people" if people > 1 else ""
+            raise DataError(
+                f"{where}: {FRAMES}: got shape {value.shape}, expected {(frames,)}, a number a frame{several}{MEND}"
+            )
+        each = np.broadcast_to(value, (people, frames))
+        return tuple(_whole(where, row) for row in each), ()
+    except DataError as error:
+        if not alone or people > 1:
+            raise
+        return (None,), (f"{str(error).removesuffix(MEND)}; left out, as one person alone needs none",)
+
+
+def _whole(where: object, row: NDArray[Any]) -> Numbers:
+    """Whole numbers of one person's frames (T,) -> the same; refused where they do not rise."""
     with np.errstate(invalid="ignore"):
-        given = given.astype(np.float64)
+        given = row.astype(np.float64)
         numbers = given.astype(np.int64)
     if (given != numbers).any() or (np.diff(given) <= 0).any() or np.ptp(given) >= LONGEST:
         raise DataError(
-            f"{where}: {FRAMES}: got {given[0]:g} to {given[-1]:g} for {frames} frames, expected whole numbers that "
-            f"rise from frame to frame, by less than {LONGEST:,} in all; mend them, or leave them out"
+            f"{where}: {FRAMES}: got {given[0]:g} to {given[-1]:g} for {len(row)} frames, expected whole numbers that "
+            f"rise from frame to frame, by less than {LONGEST:,} in all{MEND}"
         )
     return numbers
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magnet.export.smpl_clock import FRAMES
 from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import BODY_JOINTS
 
@@ -129,13 +130,15 @@ def _people_first(where: object, held: Mapping[str, Any], poses: Doubles) -> Dou
         return poses
     first, second = poses.shape[:2]
     told = _people_told(held)
-    if first in told or (first == 1 and second > 1):  # one person's shape numbers may be repeated in each frame
+    numbered = first != second and _shape_of(held, FRAMES) in ((first,), (first, 1))
+    if not numbered and (first in told or (first == 1 and second > 1)):  # shapes of one person may be a row a frame
         return poses
-    if second in told or (first > LIKELY_PEOPLE and first > 4 * second):
+    if numbered or second in told or (first > LIKELY_PEOPLE and first > 4 * second):
+        but = f", but {FRAMES} number {first} frames" if numbered else ""
         raise Unreadable(
-            f"{where}: rotations: got shape {poses.shape}, which is {first} people of {second} frames; people come "
-            "first: transpose the first two axes of all arrays that have both, as array.swapaxes(0, 1) does; if they "
-            f"are {first} people, say so by shapes: {SHAPE[0]} ({first}, 10)"
+            f"{where}: rotations: got shape {poses.shape}, which is {first} people of {second} frames{but}; people "
+            "come first: transpose the first two axes of all arrays that have both, as array.swapaxes(0, 1) does; if "
+            f"they are {first} people, say so by shapes: {SHAPE[0]} ({first}, 10)"
         )
     return poses
 
@@ -144,13 +147,18 @@ def _people_told(held: Mapping[str, Any]) -> set[int]:
     """How many people there are, by what files have for each of them: shape numbers (P, 10) and genders (P,)."""
     told = set()
     for key, axes in (*((key, 2) for key in SHAPE), (GENDER, 1)):
-        try:
-            shape = np.shape(held.get(key, 0))
-        except ValueError:  # uneven lists, or pickled in a npz
-            continue
+        shape = _shape_of(held, key)
         if len(shape) == axes:
             told.add(shape[0])
     return told
+
+
+def _shape_of(held: Mapping[str, Any], key: str) -> tuple[int, ...]:
+    """The shape of what a file has under a key; () of nothing, of uneven lists and of what is pickled in a npz."""
+    try:
+        return np.shape(held.get(key, 0))
+    except ValueError:
+        return ()
 
 
 def _require_vectors(where: object, array: Doubles) -> None:

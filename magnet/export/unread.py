@@ -8,10 +8,12 @@ MARKERS = (
     "it holds markers, not joints: let the program that took them solve skeletons, and export BVH or FBX, or write "
     "joint centres as a table, .csv"
 )
+TENSORS = "load it with torch.load, and save its tensors as NumPy arrays in an .npz: poses, trans, betas, fps"
 ADVICE = {
     ".c3d": MARKERS,
     ".trc": MARKERS,
-    ".pkl": "magnet data prepare scenes reads pickles; for one scene save the same arrays as .npz",
+    ".pt": TENSORS,
+    ".pth": TENSORS,
     ".npy": "an array alone does not tell what it is: save rotations as poses, trans and mocap_frame_rate in an .npz, "
     "positions of joints as a table, .csv",
     ".json": "write positions of joints as a table, .csv, rotations as an .npz",

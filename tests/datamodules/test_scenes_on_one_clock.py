@@ -14,6 +14,8 @@ from magnet.datamodules.fakes.motion import people
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.datamodules.scenes import ScenesReader
 from magnet.export.npz import read_smplx
+from magnet.export.reading import Reading
+from magnet.export.reading import read as read_scene
 from tests.datamodules.readers import world_joints
 
 TRUE = people(60, 2, 30.0, 3)
@@ -87,10 +89,16 @@ REFUSED: dict[str, tuple[list[dict[str, Any]], str]] = {
         [seen(0, [3, 2, 1]), seen(1, [1, 2, 3])],
         "person1: frame_ids: got 3 to 1 for 3 frames, expected whole",
     ),
-    "no numbers": ([seen(0, [1, 2]) | {"frame_ids": np.array([1.0, 2.5])}], "expected whole numbers that rise"),
-    "far": ([seen(0, [1, 2]) | {"frame_ids": np.array([1, 2**40])}], r"by less than 1,000,000 in all"),
+    "no numbers": (
+        [seen(0, [1, 2]) | {"frame_ids": np.array([1.0, 2.5])}, seen(1, [1, 2])],
+        "expected whole numbers that rise",
+    ),
+    "far": (
+        [seen(0, [1, 2]) | {"frame_ids": np.array([1, 2**40])}, seen(1, [1, 2])],
+        r"by less than 1,000,000 in all",
+    ),
     "too few": (
-        [seen(0, [1, 2, 3]) | {"frame_ids": np.array([1, 2])}],
+        [seen(0, [1, 2, 3]) | {"frame_ids": np.array([1, 2])}, seen(1, [1, 2, 3])],
         r"frame_ids: got shape \(2,\), expected \(3,\)",
     ),
 }
@@ -101,6 +109,32 @@ def test_numbers_that_do_not_tell_are_refused(kind: str, tmp_path: Path) -> None
     held, message = REFUSED[kind]
     with pytest.raises(DataError, match=message):
         read(tmp_path, held)
+
+
+@pytest.mark.parametrize("ids", [[2, 1, *range(2, 60)], [*range(7)], [*np.linspace(0, 9, 60)]])
+def test_one_person_alone_needs_no_numbers(ids: list[float], tmp_path: Path) -> None:
+    held = seen(0, [*range(60)]) | {"frame_ids": np.array(ids)}
+    for found in (read(tmp_path, held), read_scene(tmp_path / "video.pkl", options=Reading(in_fps=30.0))):
+        (note,) = (note for note in found.notes if "frame_ids" in note)
+        assert "video.pkl: frame_ids: got" in note and note.endswith("; left out, as one person alone needs none")
+    np.savez(tmp_path / "video_A.npz", fps=30, **held)
+    np.savez(tmp_path / "video_B.npz", fps=30, **seen(1, [*range(60)]))
+    (tmp_path / "video.pkl").unlink()
+    with pytest.raises(DataError, match=r"video_A\.npz: frame_ids: got .*; mend them, or leave them out"):
+        read(tmp_path)
+
+
+def test_frames_before_people_are_told_by_their_numbers(tmp_path: Path) -> None:
+    both = [seen(p, [*range(6)]) for p in (0, 1)]
+    held = {key: np.stack([one[key] for one in both], axis=1) for key in both[0]}
+    refused = (
+        r"\(6, 2, 72\), which is 6 people of 2 frames, but frame_ids number 6 frames; people come first: transpose"
+    )
+    with pytest.raises(DataError, match=refused):
+        read(tmp_path, held | {"frame_ids": np.arange(6)})
+    people_first = {key: np.swapaxes(value, 0, 1) for key, value in held.items()}
+    with pytest.raises(DataError, match=r"got shape \(6, 2\), expected \(6,\), a number .*, or \(2, 6\) for 2 people"):
+        read(tmp_path, people_first | {"frame_ids": held["frame_ids"]})
 
 
 def pair(root: Path, first: int, rate: float = 30.0, numbered: bool = True) -> None:

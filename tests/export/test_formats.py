@@ -18,7 +18,7 @@ from magnet import cli
 from magnet.body import Body, load_body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import formats, reading, resampled
-from magnet.export.retarget import together
+from magnet.export.cutting import together
 from magnet.motion.scene import Scene, cat_agents, concatenate
 from magnet.testing import random_scene
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from magnet.datamodules.clip import Split
 from magnet.datamodules.reading.recording import DataError
 from magnet.files import Refused, load_npz, regular
-from magnet.motion.runs import filled
 
 Doubles = NDArray[np.float64]
 AGAIN = "download or unpack it again, or leave it out"
@@ -145,34 +144,6 @@ def floats(where: object, value: Any, shape: Sequence[int | str], finite: bool =
     if finite and (bad := int((~np.isfinite(array)).sum())):
         raise DataError(f"{where}: {bad} of {array.size} numbers are NaN or infinite; {AGAIN}")
     return array
-
-
-def without_gaps(where: object, *parts: Doubles) -> tuple[list[Doubles], NDArray[np.bool_], tuple[str, ...]]:
-    """One person's numbers with frames that hold NaN or infinity filled by those before them.
-
-    Args:
-        where: the file, and whose numbers they are.
-        *parts: (T, ...) each.
-
-    Returns:
-        The parts; (T,) which frames the file has; and a note where it lacks some.
-
-    Raises:
-        DataError: it has none.
-    """
-    finite = [np.isfinite(part).reshape(len(part), -1).all(axis=1) for part in parts]
-    tracked: NDArray[np.bool_] = np.logical_and.reduce(finite)
-    if not tracked.any():
-        raise DataError(f"{where}: every frame holds NaN or infinity: nothing was tracked; {AGAIN}")
-    whole = [filled(part[:, None], tracked[:, None])[:, 0] for part in parts]
-    return whole, tracked, gap_note(where, tracked)
-
-
-def gap_note(where: object, tracked: NDArray[np.bool_]) -> tuple[str, ...]:
-    """What is said of frames (T,) that a file lacks."""
-    lost = int((~tracked).sum())
-    said = f"{where}: {lost} of {len(tracked)} frames hold NaN or infinity, taken as not tracked: cut out"
-    return (said,) if lost else ()
 
 
 def _fits(got: tuple[int, ...], shape: Sequence[int | str]) -> bool:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from magnet.datamodules.reading.arrays import Doubles, floats, one_length, one_shape, require
-from magnet.datamodules.reading.recording import GENDERS, Axis, DataError, Gender, Recording
-from magnet.unpickle import load_object_npy, load_pickle
+from magnet.datamodules.reading.recording import GENDERS, Axis, Gender, Recording
+from magnet.unpickle import load_object_npy, load_pickle, mapping
 
 
 @dataclass(frozen=True)
@@ -30,18 +30,6 @@ class PersonMotion:
     @property
     def frames(self) -> int:
         return len(self.poses)
-
-
-def mapping(where: object, held: Any) -> Mapping[str, Any]:
-    """What a file holds, when it is a dict with text keys.
-
-    Raises:
-        DataError: it is not.
-    """
-    if not isinstance(held, Mapping) or not all(isinstance(key, str) for key in held):
-        what = f"an array {held.shape}" if isinstance(held, np.ndarray) else f"a {type(held).__name__}"
-        raise DataError(f"{where}: holds {what}, expected a dict of named arrays; is it another file of the data set?")
-    return held
 
 
 def pickled_mapping(path: Path) -> Mapping[str, Any]:

@@ -1,0 +1,106 @@
+"""Whose motion files of SMPL's family hold: one person, a list of people, or people by name; and frames they lack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnet.errors import DataError
+from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, WHOLE, in_world, posed
+from magnet.motion.runs import filled
+from magnet.unpickle import mapping
+
+Doubles = NDArray[np.float64]
+
+PERSON = "name of the person"
+"""Our key for what somebody is called in a dict of people."""
+HELD = "they hold the pose before, and are not valid"
+"""What happens in a scene to frames in which somebody was not tracked."""
+SHARED = (*RATE, "gender", SCALE, "body")
+"""Keys that a file may have once for all its people."""
+
+
+def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Each person's arrays in a file, which holds one person, a list of people, or a dict of people by name.
+
+    Args:
+        path: the file.
+        held: what it holds.
+
+    Yields:
+        What to call the place in messages; and what is there, with motion in the world where it has that. One place
+        may hold several people, first in each array.
+
+    Raises:
+        DataError: nobody's motion is in it.
+    """
+    if isinstance(held, np.ndarray) and held.dtype == object:
+        held = held.item() if held.ndim == 0 else held.tolist()
+    if isinstance(held, list | tuple):
+        held = {f"person{p + 1}": one for p, one in enumerate(held)}
+    if isinstance(held, Mapping):
+        held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
+    held = mapping(path, held)
+    if is_posed(held):
+        yield str(path), in_world(held)
+        return
+    shared = {key: value for key, value in held.items() if key in SHARED}
+    inside = {key: value for key, value in held.items() if is_posed(value)}
+    if not inside:
+        has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
+        raise DataError(
+            f"{path}: has neither {WHOLE[0]} nor {ORIENT[0]} and {BODY[0]}, alone or for each person; it has {has}; "
+            f"save motion of SMPL's family with these keys, {PLACE[0]}, betas and {RATE[0]}"
+        )
+    for p, (key, value) in enumerate(inside.items()):
+        mine = {shared_key: one_of(said, p) for shared_key, said in shared.items()}
+        yield f"{path}, {key}", {**mine, PERSON: key, **in_world(mapping(f"{path}, {key}", value))}
+
+
+def is_posed(held: Any) -> bool:
+    """Whether something is a dict that holds rotations of somebody."""
+    return isinstance(held, Mapping) and posed(held.keys())
+
+
+def one_of(value: Any, person: int) -> Any:
+    """A person's entry of a value that a file gives once, or once per person."""
+    return (
+        value[person]
+        if isinstance(value, list | tuple | np.ndarray) and np.ndim(value) == 1 and len(value) > person
+        else value
+    )
+
+
+def without_gaps(
+    where: object, *parts: Doubles, lost: str = "cut out"
+) -> tuple[list[Doubles], NDArray[np.bool_], tuple[str, ...]]:
+    """One person's numbers with frames that hold NaN or infinity filled by those before them.
+
+    Args:
+        where: the file, and whose numbers they are.
+        *parts: (T, ...) each.
+        lost: what happens to such frames, for the note on them.
+
+    Returns:
+        The parts; (T,) which frames the file has; and a note where it lacks some.
+
+    Raises:
+        DataError: it has none.
+    """
+    finite = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in parts]
+    tracked: NDArray[np.bool_] = np.logical_and.reduce(finite)
+    if len(tracked) and not tracked.any():
+        raise DataError(f"{where}: every frame holds NaN or infinity: nothing was tracked; leave the file out")
+    whole = [filled(part[:, None], tracked[:, None])[:, 0] for part in parts]
+    return whole, tracked, gap_note(where, tracked, lost)
+
+
+def gap_note(where: object, tracked: NDArray[np.bool_], lost: str = "cut out") -> tuple[str, ...]:
+    """What is said of frames (T,) that a file lacks. lost: what happens to them"""
+    missing = int((~tracked).sum())
+    said = f"{where}: {missing} of {len(tracked)} frames hold NaN or infinity, taken as not tracked: {lost}"
+    return (said,) if missing else ()
