@@ -28,6 +28,7 @@ from magnet.export.smpl_keys import (
     SMPLX_PELVIS,
     WORLD,
     Unreadable,
+    in_world,
     rotations,
     there_in_world,
 )
@@ -106,7 +107,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         for where, one in people:
             if there_in_world(one):
                 notes.append(f"{' and '.join(WORLD)} are taken, not what the camera sees")
-            found = list(self._tracks(where, one, notes))
+            found = list(self._tracks(where, in_world(one), notes))
             lone = alone and len(people) == 1
             numbers, left = frame_numbers(where, one, found[0].frames, len(found), lone)
             notes += left
@@ -127,9 +128,8 @@ class ScenesReader(OwnReader[PosedTrack]):
         fps = float(self.fps if rate is None else floats(f"{where}: frame rate", np.ravel(rate)[:1], (1,))[0])  # type: ignore[arg-type]
         several = poses.ndim == 3
         place = _first(where, held, PLACE)
-        one_length(
-            where, {"rotations": poses.shape[-2], "translations": np.shape(place)[-2] if np.ndim(place) > 1 else 0}
-        )
+        if np.ndim(place) == poses.ndim:
+            one_length(where, {"rotations": poses.shape[-2], "translations": np.shape(place)[-2]})
         places = floats(f"{where}: translations", place, (*poses.shape[:-1], 3), finite=False)
         if SCALE in held:
             places = places / floats(f"{where}: {SCALE}", np.ravel(held[SCALE])[:1], (1,))

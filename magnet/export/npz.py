@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from magnet.export.smpl_keys import (
     in_world,
     rotations,
 )
-from magnet.export.smpl_people import without_gaps
+from magnet.export.smpl_people import PERSON, without_gaps
 from magnet.export.upright import LONG, WARNING, Stance, axis_of, stance
 from magnet.files import DAMAGED, load_npz, save_npz, suffixed
 from magnet.motion.frames import rigid
@@ -321,10 +321,10 @@ def _number(where: str | Path, key: str, held: Mapping[str, Any], what: str) -> 
 
 
 def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> _Held:
+    _require_keys(where, held, in_fps)
     held = in_world(held)
     there = set(held)
     ours = {"body", "surface_model_type"} <= there  # other programs may mean something else by `body`
-    _require_keys(where, there, ours, in_fps)
     place, shape = first_of(("transl", *PLACE), there) or "", first_of(SHAPE, there)
     arrays = {"poses": rotations(where, held), "transl": _numbers(where, held, place)}
     arrays["betas"] = np.zeros((*arrays["poses"].shape[:-2], 10)) if shape is None else _numbers(where, held, shape)
@@ -346,18 +346,19 @@ def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) ->
     return tensors, fps, written_for, str(held["name"]) if "name" in there else ""
 
 
-def _require_keys(where: str | Path, there: Collection[str], ours: bool, in_fps: float | None) -> None:
+def _require_keys(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> None:
     """Refuse a file without motion or rate, by our names of what is missing."""
+    own, there = set(held) - {PERSON}, set(in_world(held))
     whole = first_of(WHOLE, there) or (first_of(ORIENT, there) and first_of(BODY, there))
     unrated = in_fps is None and not first_of(RATE, there)
     missing = ["mocap_frame_rate"] * unrated + ["poses"] * (not whole) + ["transl"] * (not first_of(PLACE, there))
-    if ours and "betas" not in there:
+    if {"body", "surface_model_type"} <= there and "betas" not in there:
         missing.insert(0, "betas")
     if missing:
         fix = "; say the frames a second: --in_fps 30 (in_fps=30)" if unrated else ""
         if not whole and not first_of(PLACE, there):
             fix = "; positions of joints are read from a table, .csv (docs/export.md)" + fix
-        raise ValueError(f"{where}: lacks {', '.join(missing)}; it has {', '.join(sorted(there))}{fix}")
+        raise ValueError(f"{where}: lacks {', '.join(missing)}; it has {', '.join(sorted(own))}{fix}")
 
 
 def _rate(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> float:

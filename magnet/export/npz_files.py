@@ -170,7 +170,9 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
     """What a file holds, and how it was read. alone: no other file is of the scene"""
     if path.suffix.lower() == PICKLE:
         there = list(people_in(path, load_pickle(path)))
-        read = [_foreign(where, one, scene_of(where, one, body, up, unit, in_fps), body, up) for where, one in there]
+        read = [
+            _foreign(path, where, one, scene_of(where, one, body, up, unit, in_fps), body, up) for where, one in there
+        ]
         if up is None:
             read = _of_one_world(read)
         return [_numbered(one, held, alone and len(there) == 1) for one, (_, held) in zip(read, there, strict=True)]
@@ -183,7 +185,7 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     if _ours(keys):
         return [_own(path, body, up, unit, in_fps)]
-    one = _foreign(str(path), keys, read_smplx(path, body, up, unit, in_fps), body, up)
+    one = _foreign(path, str(path), keys, read_smplx(path, body, up, unit, in_fps), body, up)
     held = {}
     if FRAMES in keys:
         with load_npz(path) as file, contextlib.suppress(ValueError):  # pickled, such as names of pictures
@@ -206,7 +208,9 @@ def _own(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float
     return NpzFile(str(path), scene, [], False, "y", (None,) * scene.agents)
 
 
-def _foreign(where: str, keys: Collection[str], read: tuple[Scene, str], body: Body, up: str | None) -> NpzFile:
+def _foreign(
+    path: Path, where: str, keys: Collection[str], read: tuple[Scene, str], body: Body, up: str | None
+) -> NpzFile:
     """A scene under SMPL-X's keys, and what should be known of it. up: as it was asked for"""
     (scene, found), name, notes = read, Path(where).name, list[str]()
     ours = {"body", "surface_model_type"} <= set(keys)
@@ -216,7 +220,7 @@ def _foreign(where: str, keys: Collection[str], read: tuple[Scene, str], body: B
         notes.append(f"{name}: people stand along {found}, which is taken for up; if they lie, say --up=y")
     if not ours and is_open(body):
         notes.append(
-            f"{name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body FILE "
+            f"{path.name}: SMPL-X's shapes mean nothing to the open body, which keeps its average shape; --body FILE "
             "names theirs"
         )
     return NpzFile(where, scene, notes, not ours, found)

@@ -140,7 +140,7 @@ def read(
         )
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
-    notes = [note for one in people for note in one.notes]
+    notes = list(dict.fromkeys(note for one in people for note in one.notes))  # people of one file share some
     if len(scenes) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
         notes += rates_note([scenes[0].fps], scene.fps)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.errors import DataError
-from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, WHOLE, in_world, posed
+from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, WHOLE, posed
 from magnet.motion.runs import filled
 from magnet.unpickle import mapping
 
@@ -20,6 +20,8 @@ PERSON = "name of the person"
 """Our key for what somebody is called in a dict of people."""
 HELD = "they hold the pose before, and are not valid"
 """What happens in a scene to frames in which somebody was not tracked."""
+IN_WORLD, SEEN = "_global", "_incam"
+"""In the names under which trackers keep somebody twice: in the world, and as a camera sees them."""
 SHARED = (*RATE, "gender", SCALE, "body")
 """Keys that a file may have once for all its people."""
 
@@ -32,8 +34,7 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         held: what it holds.
 
     Yields:
-        What to call the place in messages; and what is there, with motion in the world where it has that. One place
-        may hold several people, first in each array.
+        What to call the place in messages; and what is there: of one person, or of several along the first axis.
 
     Raises:
         DataError: nobody's motion is in it.
@@ -46,10 +47,14 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
     held = mapping(path, held)
     if is_posed(held):
-        yield str(path), in_world(held)
+        yield str(path), held
         return
     shared = {key: value for key, value in held.items() if key in SHARED}
     inside = {key: value for key, value in held.items() if is_posed(value)}
+    seen_so = {
+        key.replace(IN_WORLD, SEEN) for key in inside if IN_WORLD in key
+    }  # the same person, as a camera sees them
+    inside = {key: value for key, value in inside.items() if key not in seen_so}
     if not inside:
         has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
         raise DataError(
@@ -58,7 +63,7 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         )
     for p, (key, value) in enumerate(inside.items()):
         mine = {shared_key: one_of(said, p) for shared_key, said in shared.items()}
-        yield f"{path}, {key}", {**mine, PERSON: key, **in_world(mapping(f"{path}, {key}", value))}
+        yield f"{path}, {key}", {**mine, PERSON: key, **mapping(f"{path}, {key}", value)}
 
 
 def is_posed(held: Any) -> bool:

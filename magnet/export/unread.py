@@ -16,6 +16,9 @@ ADVICE = {
     ".pth": TENSORS,
     ".npy": "an array alone does not tell what it is: save rotations as poses, trans and mocap_frame_rate in an .npz, "
     "positions of joints as a table, .csv",
+    ".tsv": "rename it to .csv: tabs between columns are understood",
+    ".txt": "rename a table of joint positions to .csv",
+    ".parquet": "write it as CSV, such as by pandas: read_parquet(FILE).to_csv(FILE.csv, index=False)",
     ".json": "write positions of joints as a table, .csv, rotations as an .npz",
     ".amc": "magnet data prepare cmu reads CMU's; convert others to BVH",
     ".asf": "magnet data prepare cmu reads CMU's; convert others to BVH",

@@ -190,6 +190,26 @@ def test_places_in_the_world_beat_those_that_a_camera_sees(tmp_path: Path) -> No
     assert (shown.T_world_root - wanted.T_world_root).abs().max() == 0
 
 
+def test_who_is_in_a_file_in_the_world_and_as_a_camera_sees_them_is_one_person(tmp_path: Path) -> None:
+    one = seen(0, [*range(60)], False)
+    held = {"smpl_params_global": one, "smpl_params_incam": one | {"trans": np.zeros((60, 3))}}
+    found = read(tmp_path, held)
+    assert found.persons == ("smpl_params_global",) and found.transl is not None
+    assert np.allclose(found.transl[:, 0], one["trans"])
+    assert read_scene(tmp_path / "video.pkl", options=Reading(in_fps=30.0)).scene.agents == 1
+    assert len(read(tmp_path, {"anna_incam": one, "ben_incam": one}).persons) == 2
+
+
+def test_what_a_file_has_is_named_by_its_own_keys(tmp_path: Path) -> None:
+    one = seen(0, [*range(60)], False)
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({0: {"pose_world": one["pose"], "trans_world": one["trans"]}}))
+    with pytest.raises(ValueError, match=r"a\.pkl, 0: lacks mocap_frame_rate; it has pose_world, trans_world; say"):
+        read_scene(tmp_path / "a.pkl")
+    (tmp_path / "a.pkl").unlink()
+    with pytest.raises(DataError, match=r"translations: got shape \(60, 1, 3\), expected \(60, 3\)"):
+        read(tmp_path, one | {"trans": one["trans"][:, None]})
+
+
 @pytest.mark.parametrize(
     "more",
     [
