@@ -1,8 +1,8 @@
 """Reads untrusted pickles without running code in them; any damage is a `DataError`.
 
-A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; anything else that it
-names is refused. Arrays are rebuilt here, from bytes whose number must fit, so that a damaged header neither reserves
-memory nor reaches numpy's own unpickling.
+A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; a defaultdict becomes
+a dict, and anything else that it names is refused. Arrays are rebuilt here, from bytes whose number must fit, so that a
+damaged header neither reserves memory nor reaches numpy's own unpickling.
 """
 
 from __future__ import annotations
@@ -234,15 +234,17 @@ ADMITTED: dict[str, Callable[..., Any]] = {
     "numpy._core.numeric _frombuffer": _from_buffer,
     "_codecs encode": _encode,
     "collections OrderedDict": OrderedDict,
+    "collections defaultdict": lambda *_: {},
     **{
         f"{module} {name}": call
         for module in ("builtins", "__builtin__")
         for name, call in (("set", set), ("frozenset", frozenset), ("complex", complex), ("bytes", lambda: b""))
     },
+    # What a defaultdict makes of keys that are not there.
+    **{f"{module} dict": lambda: {} for module in ("builtins", "__builtin__")},
+    **{f"{module} list": lambda: [] for module in ("builtins", "__builtin__")},
 }
 """Everything that a pickle may name; numpy's are replaced by stand-ins."""
-
-
 BY_HAND = {
     "joblib.": "open it with joblib.load, as joblib wrote it,",
     "torch.": "load it yourself, make arrays of its tensors by .cpu().numpy()",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ PLAIN: dict[str, Any] = {
     "integer": np.int64(4),
     "nested": [1, (2.0, {"three": None}), {4, 5}, frozenset({6}), b"seven", True, 1 + 2j],
     "ordered": OrderedDict(a=1),
+    "default": defaultdict(dict, a={"b": 1}),
+    "default of lists": defaultdict(list, a=[1]),
 }
 
 

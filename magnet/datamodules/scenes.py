@@ -72,7 +72,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
-    version: ClassVar[int] = 3  # numbered frames tell the moments of several files, too
+    version: ClassVar[int] = 4  # who is in a file in the world and as a camera sees them is one person
 
     def __init__(self, root: str | Path, fps: float | None = None, **kwargs: Any) -> None:
         super().__init__(root, **kwargs)

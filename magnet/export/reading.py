@@ -135,9 +135,7 @@ def read(
         return _from_tables(files, body, options)
     if options.joints:
         kinds = ", ".join((*RIGS, TABLE))
-        raise ValueError(
-            f"{files[0]}: joint: is for {kinds}; in an {files[0].suffix.lower()} joints are where SMPL-X has them"
-        )
+        raise ValueError(f"{files[0]}: joint: is for {kinds}; in arrays joints are where SMPL-X has them")
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = list(dict.fromkeys(note for one in people for note in one.notes))  # people of one file share some

@@ -44,16 +44,14 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if isinstance(held, list | tuple):
         held = {f"person{p + 1}": one for p, one in enumerate(held)}
     if isinstance(held, Mapping):
-        held = {str(key) if isinstance(key, int) else key: value for key, value in held.items()}
+        held = {str(key) if isinstance(key, int | np.integer) else key: value for key, value in held.items()}
     held = mapping(path, held)
     if is_posed(held):
         yield str(path), held
         return
     shared = {key: value for key, value in held.items() if key in SHARED}
     inside = {key: value for key, value in held.items() if is_posed(value)}
-    seen_so = {
-        key.replace(IN_WORLD, SEEN) for key in inside if IN_WORLD in key
-    }  # the same person, as a camera sees them
+    seen_so = {key.replace(IN_WORLD, SEEN) for key in inside if IN_WORLD in key}
     inside = {key: value for key, value in inside.items() if key not in seen_so}
     if not inside:
         has = ", ".join(sorted(map(str, held))[:20]) or "nothing"

@@ -45,7 +45,7 @@ def off(found: Recording, first: int) -> float:
 
 @pytest.mark.parametrize("second", [(20, 60), (20, 50), (10, 40)])
 def test_people_are_laid_on_each_other_by_the_numbers_of_frames(second: tuple[int, int], tmp_path: Path) -> None:
-    found = read(tmp_path, {0: seen(0, [*range(50)]), 1: seen(1, [*range(*second)])})
+    found = read(tmp_path, {np.int64(0): seen(0, [*range(50)]), 1: seen(1, [*range(*second)])})
     assert found.frames == min(50, second[1]) - second[0]
     assert off(found, second[0]) < 1e-5
     (note,) = (note for note in found.notes if "frame_ids" in note)
