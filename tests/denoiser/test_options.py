@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from magnet.denoiser import levels
 from magnet.denoiser.losses import snr_weights
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.options import Sampling, SelfForcing
@@ -147,13 +148,11 @@ def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
 
 def test_min_snr_counts_each_error_by_the_level_it_was_made_at(scene: Scene, monkeypatch):
     """All at one level: the token losses are the plain ones times that level's weight."""
-    from magnet.denoiser import module
-
     plain, weighted = tiny_denoiser(), tiny_denoiser(loss={"weighting": "min_snr", "snr_gamma": 3.0})
     scene = scene.slice(0, 32)
     for level in (0, 300, 600, 900, 1000):
         at = torch.full((2, 8, 3), level)
-        monkeypatch.setattr(module, "draw_levels", lambda *_, at=at: at)
+        monkeypatch.setattr(levels, "draw_levels", lambda *_, at=at: at)
         a, b = (model.losses(scene, torch.Generator().manual_seed(0)) for model in (plain, weighted))
         weight = snr_weights(torch.tensor(level), 3.0)
         for name in ("latent", "delta", "pairwise"):

@@ -367,16 +367,3 @@ def test_deviations_can_be_learnt(model: Denoiser):
         p.grad is not None and p.grad.isfinite().all() and p.grad.abs().sum() > 0 for p in posterior.parameters()
     )
     assert guess.grad is not None and guess.grad.isfinite().all()
-
-
-def test_a_checkpoint_from_before_can_be_given_one(tmp_path, model: Denoiser):
-    with_one = tiny_denoiser(max_agents=3, window=8, network={"pairwise_posterior": True})
-    checkpoint = {
-        "state_dict": dict(model.state_dict()),
-        "tokenizer_hyper_parameters": dict(model.tokenizer.hparams),
-    }
-    with_one.on_load_checkpoint(checkpoint)
-    with_one.load_state_dict(checkpoint["state_dict"])
-    _, _, noisy, levels, present = shown(model, 100)
-    plain, better = (each.denoise(noisy, levels, present) for each in (model, with_one))
-    assert not torch.equal(plain, better)
