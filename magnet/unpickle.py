@@ -206,7 +206,7 @@ class _Array:
 
 def _from_buffer(raw: Any, dtype: _Dtype, shape: tuple[int, ...], order: str) -> _Array:
     array = _Array()
-    array.state = (tuple(shape), dtype, order == "F", bytes(raw))
+    array.state = (tuple(shape), dtype, order == "F", raw)
     return array
 
 
@@ -220,6 +220,8 @@ def _encode(text: str, encoding: str = "latin-1") -> bytes:
 
 
 def _bytes(raw: Any) -> bytes:
+    if not isinstance(raw, str | bytes | bytearray | memoryview):  # of a number, `bytes` would be so many zeros
+        raise DataError(f"not a whole pickle ({type(raw).__name__} in place of an array's bytes); {AGAIN}")
     return raw.encode("latin-1") if isinstance(raw, str) else bytes(raw)
 
 
@@ -252,6 +254,19 @@ BY_HAND = {
 """How a trusted file of some packages' classes is opened, by how their modules begin."""
 
 
+class _Call:
+    """A function that a pickle may call and, unlike a bare one, not change: its defaults would last."""
+
+    def __init__(self, call: Callable[..., Any]) -> None:
+        self.call = call
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.call(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise DataError(f"not a whole pickle (it changes a function); {AGAIN}")
+
+
 class _Restricted(pickle.Unpickler):
     def __init__(self, data: bytes, where: str, also: Also) -> None:
         super().__init__(io.BytesIO(data), encoding="latin-1")
@@ -267,7 +282,7 @@ class _Restricted(pickle.Unpickler):
                 f"expected numpy arrays, numbers, text, dict, list and tuple. If you trust the file, {by_hand} and "
                 "save plain arrays"
             )
-        return admitted
+        return admitted if isinstance(admitted, type) else _Call(admitted)
 
     def persistent_load(self, pid: Any) -> Any:
         """Refused."""

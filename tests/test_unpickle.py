@@ -114,6 +114,16 @@ def test_refused_code_has_not_run(tmp_path: Path) -> None:
     assert not (tmp_path / "proof").exists()
 
 
+def test_no_pickle_changes_how_the_next_one_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "file.pkl"
+    # The state of what is pickled as `_codecs.encode`: (None, {"__defaults__": ("utf-16",)}).
+    path.write_bytes(b"\x80\x02c_codecs\nencode\nN}X\x0c\x00\x00\x00__defaults__X\x06\x00\x00\x00utf-16\x85s\x86b0N.")
+    with pytest.raises(DataError, match="changes a function"):
+        load_pickle(path)
+    path.write_bytes(b"c_codecs\nencode\n(Va\ntR.")  # encode("a")
+    assert load_pickle(path) == b"a"
+
+
 def test_records_and_wild_sizes_are_refused_without_reserving_them(tmp_path: Path) -> None:
     path = tmp_path / "file.pkl"
     path.write_bytes(pickle.dumps(np.zeros(2, dtype=[("a", "f4")])))
@@ -122,6 +132,11 @@ def test_records_and_wild_sizes_are_refused_without_reserving_them(tmp_path: Pat
     whole = pickle.dumps(np.zeros(70000, dtype=np.uint8), protocol=2)
     path.write_bytes(whole.replace((70000).to_bytes(4, "little"), (2**31 - 1).to_bytes(4, "little"), 1))
     with pytest.raises(DataError, match="2147483647"):
+        load_pickle(path)
+    # An array of a million bytes, with a million in place of its bytes.
+    million = b"I1000000\n"
+    path.write_bytes(b"cnumpy.core.numeric\n_frombuffer\n(%bcnumpy\ndtype\n(Vu1\ntR(%btVC\ntR." % (million, million))
+    with pytest.raises(DataError, match="int in place of"):
         load_pickle(path)
     path.write_bytes(b"\x80\x02]r\xff\xff\xff\xff.")  # a memo of four thousand million entries
     with pytest.raises(DataError, match="not a whole pickle"):
