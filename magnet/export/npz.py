@@ -193,10 +193,10 @@ def _scene_of(where: str | Path, read: _Held, body: Body, up: str | None, unit: 
     if betas.ndim == 3 and betas.shape[1]:  # a row a frame, or one for all
         betas = betas.quantile(0.5, dim=1)
     P, T = poses.shape[:2]
-    fits = poses.ndim == 3 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
+    fits = poses.ndim == 3 and P > 0 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
     if not fits or betas.ndim != 2 or len(betas) != P:
         shapes = f"poses {tuple(poses.shape)}, transl {tuple(transl.shape)}, betas {tuple(betas.shape)}"
-        raise ValueError(f"{where}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10)")
+        raise ValueError(f"{where}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10) of P people")
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
     poses, transl, valid = _without_gaps(where, poses[..., : 3 * BODY_JOINTS], transl)
     if written_for is None and is_open(body):
@@ -338,7 +338,7 @@ def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) ->
         raise ValueError(f"{where}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
     tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
     if ours and "given" in there:
-        given, expected = held["given"], arrays["poses"].shape[:-1]
+        given, expected = np.asarray(held["given"]), arrays["poses"].shape[:-1]
         if given.dtype != bool or given.shape != expected:
             raise ValueError(f"{where}: given: got {given.dtype} {given.shape}, expected bool {expected}")
         tensors["given"] = torch.from_numpy(given)

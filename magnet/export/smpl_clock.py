@@ -39,12 +39,12 @@ def frame_numbers(
     Raises:
         DataError: not one whole number a frame, or they do not rise.
     """
-    value = np.asarray(held.get(FRAMES))
-    if value.dtype.kind not in "iuf" or not value.size:  # names of pictures, say
-        return (None,) * people, ()
-    if value.shape == (frames, 1):
-        value = value.T
     try:
+        value = _table(where, held.get(FRAMES))
+        if value.dtype.kind not in "iuf" or not value.size:  # names of pictures, say
+            return (None,) * people, ()
+        if value.shape == (frames, 1):
+            value = value.T
         if value.shape not in ((frames,), (1, frames), (people, frames)):
             several = f", or {(people, frames)} for {people} people" if people > 1 else ""
             raise DataError(
@@ -56,6 +56,14 @@ def frame_numbers(
         if not alone or people > 1:
             raise
         return (None,), (f"{str(error).removesuffix(MEND)}; left out, as one person alone needs none",)
+
+
+def _table(where: object, value: Any) -> NDArray[Any]:
+    """What a file has under `FRAMES` as an array."""
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise DataError(f"{where}: {FRAMES}: lists of unequal length, expected a number a frame{MEND}") from error
 
 
 def _whole(where: object, row: NDArray[Any]) -> Numbers:

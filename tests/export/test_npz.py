@@ -11,7 +11,7 @@ import torch
 
 from magnet.body import Body, load_body
 from magnet.export import load_smplx, save_smplx
-from magnet.export.npz import read_smplx
+from magnet.export.npz import read_smplx, scene_of
 from magnet.export.rig import UP
 from magnet.export.smpl_keys import SMPLX_PELVIS
 from magnet.motion.scene import Scene
@@ -86,6 +86,8 @@ def test_what_was_given_comes_back_beside_the_conventional_keys(trio: Scene, bod
             assert set(file.files) - set(without.files) == {"given"}
         wanted = given[:, :, p : p + 1] if apart else given
         assert torch.equal(load_smplx(path, body).given, wanted)
+        as_lists = {key: value.tolist() for key, value in dict(np.load(path)).items()}  # such as in a pickle
+        assert torch.equal(scene_of(path, as_lists, body)[0].given, wanted)
     assert load_smplx(plain, body).given is None
 
 
@@ -101,6 +103,9 @@ def test_what_does_not_fit_is_named(trio: Scene, body: Body, tmp_path: Path) -> 
     np.savez(tmp_path / "c.npz", poses=np.zeros((4, 63)), **facts)
     with pytest.raises(ValueError, match=r"poses \(1, 4, 63\).*66 or more"):
         load_smplx(tmp_path / "c.npz", body)
+    nobody = {"poses": np.zeros((0, 4, 165)), "transl": np.zeros((0, 4, 3)), "betas": np.zeros((0, 10))}
+    with pytest.raises(ValueError, match=r"poses \(0, 4, 165\).*of P people"):
+        scene_of("nobody", {**facts, **nobody}, body)
     np.savez(tmp_path / "d.npz", poses=np.zeros((4, 165)), body="other", surface_model_type="smplx", **facts)
     with pytest.raises(ValueError, match="written for body 'other'"):
         load_smplx(tmp_path / "d.npz", body)

@@ -192,4 +192,6 @@ def test_numbers_of_every_kind_are_told_from_what_is_none() -> None:
         frame_numbers("file", {"frame_ids": np.zeros((2, 3))}, 3, 3)
     with pytest.raises(DataError, match="whole numbers that rise"):
         frame_numbers("file", {"frame_ids": np.array([1.0, np.nan, 3.0])}, 3, 1)
+    with pytest.raises(DataError, match="file: frame_ids: lists of unequal length"):
+        frame_numbers("file", {"frame_ids": [[1, 2], [3]]}, 3, 2)
     assert shared_clock("file", [None, None], ["A", "B"]) is None
