@@ -145,7 +145,8 @@ class TokenModelCore(nn.Module):
         model.on_load_checkpoint(checkpoint)
         trained, own = checkpoints.class_of(checkpoint), cls.__name__.removesuffix("Core")
         name = trained.rpartition(".")[2]
-        other = not trained.startswith("magnet.") and name not in [each.__name__ for each in cls.__mro__]
+        known = [each.__name__ for each in cls.__mro__ if not each.__module__.startswith("magnet.")]
+        other = not trained.startswith("magnet.") and name not in known
         if lost := sorted(model.state_dict().keys() ^ checkpoint["state_dict"].keys()):
             hint = f"; it was trained as {trained}: load it with {name}.load" if other else ""
             raise ValueError(f"{path}: holds other weights than a {own} of its options has, such as {lost[0]}{hint}")

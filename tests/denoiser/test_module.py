@@ -268,6 +268,9 @@ def test_a_class_of_ones_own_is_loaded_with_its_options_and_as_a_plain_denoiser_
     else:
         with pytest.warns(UserWarning, match=r"trained as .*\.Mine, and is a plain Denoiser here: .*Mine\.load\(path"):
             assert magnet.load(path).denoiser.noise.shift == 5.0
+        checkpoints.save(checkpoint | {"magnet_config": {"model": {"class_path": "mine.Denoiser"}}}, Path(path))
+        with pytest.warns(UserWarning, match="trained as mine.Denoiser, and is a plain Denoiser here"):
+            Denoiser.load(path)
 
 
 def test_absent_agents_cost_nothing(generator):
