@@ -133,6 +133,11 @@ def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
     Raises:
         DataError: damaged or refused; begins with `where`.
     """
+    if data.startswith(COMPRESSED):
+        raise DataError(
+            f"{where}: is compressed, expected a plain pickle. If you trust the file, {BY_HAND['joblib.']} and save "
+            "plain arrays"
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # damaged text has escapes that mean nothing
@@ -252,6 +257,8 @@ BY_HAND = {
     "torch.": "load it yourself, make arrays of its tensors by .cpu().numpy()",
 }
 """How a trusted file of some packages' classes is opened, by how their modules begin."""
+COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b", b"BZh", b"\xfd7zXZ")
+"""How the bytes of zlib, gzip, bz2 and xz begin, and those of no pickle."""
 
 
 class _Call:

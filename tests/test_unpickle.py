@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 import pickle
+import zlib
 from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any
@@ -178,15 +182,24 @@ def test_a_missing_file_and_a_folder_are_data_errors(tmp_path: Path) -> None:
         load_object_npy(tmp_path)
 
 
+JOBLIB = "open it with joblib.load, as joblib wrote it, and save plain arrays"
+
+
 @pytest.mark.parametrize(
-    ("module", "how"),
+    ("held", "how"),
     [
-        ("joblib.numpy_pickle", "open it with joblib.load, as joblib wrote it, and save plain arrays"),
-        ("torch._utils", r"make arrays of its tensors by \.cpu\(\)\.numpy\(\) and save plain arrays"),
-        ("posix", "load it yourself and save plain arrays"),
+        (b"cjoblib.numpy_pickle\nAnything\n.", JOBLIB),
+        (zlib.compress(b"N."), JOBLIB),
+        (zlib.compress(b"N.", 3), JOBLIB),
+        (gzip.compress(b"N."), JOBLIB),
+        (bz2.compress(b"N."), JOBLIB),
+        (lzma.compress(b"N."), JOBLIB),
+        (b"ctorch._utils\nAnything\n.", r"make arrays of its tensors by \.cpu\(\)\.numpy\(\) and save plain arrays"),
+        (b"cposix\nAnything\n.", "load it yourself and save plain arrays"),
     ],
+    ids=["joblib", "zlib", "zlib, level 3", "gzip", "bz2", "xz", "torch", "posix"],
 )
-def test_what_is_refused_is_said_with_how_a_trusted_file_is_opened(module: str, how: str, tmp_path: Path) -> None:
-    (tmp_path / "file.pkl").write_bytes(f"c{module}\nAnything\n.".encode())
+def test_what_is_refused_is_said_with_how_a_trusted_file_is_opened(held: bytes, how: str, tmp_path: Path) -> None:
+    (tmp_path / "file.pkl").write_bytes(held)
     with pytest.raises(DataError, match=f"If you trust the file, .*{how}"):
         load_pickle(tmp_path / "file.pkl")
