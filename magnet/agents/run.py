@@ -123,6 +123,16 @@ class Report:
             "resets": pace.resets if pace else 0,
         }  # fmt: skip
 
+    def lag(self) -> str | None:
+        """What to do where most tokens came late; None: they did not."""
+        if 2 * self.late <= self.tokens:
+            return None
+        made = f", each made in {1000 * statistics.median(self.took) / self.speed:.0f} ms" if self.took else ""
+        return (
+            f"{self.late} of {self.tokens} tokens came late{made}, where {1000 * PERIOD / self.speed:.0f} ms are due: "
+            "give all agents a lower --speed, or this one --settle off or fewer --steps"
+        )
+
 
 class Process:
     """An agent's process.

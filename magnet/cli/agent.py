@@ -193,6 +193,8 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))
     if process.unheard:
         print(f"magnet: never heard {', '.join(process.unheard)}: are addresses and keys theirs?", file=sys.stderr)
+    if lag := process.report.lag():
+        print(f"magnet: {lag}", file=sys.stderr)
     report = process.report.told(member, gate, process.pace)
     print(json.dumps(report))
     if given.report is not None:

@@ -10,7 +10,7 @@ import torch
 from magnet.agents.agent import Player
 from magnet.agents.gate import Gate
 from magnet.agents.message import Message, pack, unpack
-from magnet.agents.run import AWAY, LOST, PERIOD, Pace, Process
+from magnet.agents.run import AWAY, LOST, PERIOD, Pace, Process, Report
 from magnet.testing import random_scene
 
 
@@ -242,3 +242,16 @@ def test_a_recording_keeps_the_pace_of_the_others_where_that_is_asked_for():
         process.turn()
     begun = line.now
     assert process.turn() and line.now == pytest.approx(begun), "who is gone is not waited for"
+
+
+@pytest.mark.parametrize("late", [0, 10, 11, 20])
+def test_who_is_mostly_late_is_told_what_to_do(late):
+    """In real time: at half the clock's speed a token takes twice what it takes in the scene's."""
+    report = Report(tokens=20, late=late, speed=0.5)
+    report.took.extend([0.1, 0.2, 0.3])
+    told = report.lag()
+    if late <= 10:
+        assert told is None
+    else:
+        assert told is not None and told.startswith(f"{late} of 20 tokens came late, each made in 400 ms, where 267 ms")
+        assert "--speed" in told
