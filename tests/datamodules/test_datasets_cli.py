@@ -17,7 +17,9 @@ from magnet.datamodules.fakes import remocap as fake_remocap
 from tests.cases import some_slow
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
-TINY = {"latent": "8", "hidden": "8", "codes": "8", "depth": "1"}
+TINY = {
+    "quantizer.codebook_dim": "8", "quantizer.codebook_size": "8", "network.width": "8", "network.depth": "1",
+}  # fmt: skip
 SMALL = {
     "batch_size": "2", "epoch_size": "4", "window_frames": "16", "val_batch_size": "2",
     "test.context_frames": "8", "test.horizon_frames": "8", "test.limit": "2",
