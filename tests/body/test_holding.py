@@ -94,6 +94,18 @@ def test_a_hand_holds_one_hand() -> None:
     assert bool((by_left_of_first == 1).all())
 
 
+@pytest.mark.parametrize("longer", [0, 1])
+def test_of_two_whom_a_hand_could_hold_it_holds_who_is_longer_near(longer: int) -> None:
+    """Three people; the last one's hand is near both others', one of whom comes ten frames later."""
+    joints = standing_people(frames=30, agents=3).clone()
+    hands = hand_points(joints)
+    for p, offset in ((0, 0.15), (1, -0.15)):
+        joints[:, :, p] += (hands[:, :, 2, 1] - hands[:, :, p, 0] + torch.tensor([offset, 0.0, 0.0]))[:, :, None]
+    joints[:, :10, 1 - longer] += 10.0
+    held = lasting_holds(joints, torch.ones(1, 3, dtype=torch.bool), FPS)[0][0, :, 1:, 0, 1]  # the last one's right
+    assert held[:, longer].all() and not held[:, 1 - longer].any()
+
+
 def test_nobody_holds_who_is_not_there() -> None:
     joints = two_people(near((20, 0.1)))
     assert not lasting_holds(joints, torch.tensor([[True, False]]), FPS)[0].any()
