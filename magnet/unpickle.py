@@ -245,11 +245,15 @@ ADMITTED: dict[str, Callable[..., Any]] = {
     **{
         f"{module} {name}": call
         for module in ("builtins", "__builtin__")
-        for name, call in (("set", set), ("frozenset", frozenset), ("complex", complex), ("bytes", lambda: b""))
+        for name, call in (
+            ("set", set),
+            ("frozenset", frozenset),
+            ("complex", complex),
+            ("bytes", lambda: b""),
+            ("dict", lambda: {}),  # what a defaultdict makes of keys that are not there, as list
+            ("list", lambda: []),
+        )
     },
-    # What a defaultdict makes of keys that are not there.
-    **{f"{module} dict": lambda: {} for module in ("builtins", "__builtin__")},
-    **{f"{module} list": lambda: [] for module in ("builtins", "__builtin__")},
 }
 """Everything that a pickle may name; numpy's are replaced by stand-ins."""
 BY_HAND = {
