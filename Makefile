@@ -69,7 +69,7 @@ test-browser: $(READY)  ## the viewer in a real headless Chromium, installed fro
 test-blender: $(READY)  ## our files in Blender, whose bpy gets an environment of its own (Python 3.11)
 	@echo "test-blender: pytest, exported files in Blender"
 	@test -x .venv-bpy/bin/python || { python3.11 -m venv .venv-bpy && .venv-bpy/bin/pip install -qq 'bpy==4.5.*'; }
-	@MAGNET_BLENDER=.venv-bpy/bin/python $(PY) -m pytest -q -s tests/export/test_blender.py
+	@MAGNET_BLENDER=.venv-bpy/bin/python $(PY) -m pytest -q -s tests/export/test_blender.py tests/export/test_blender_addon.py
 
 test-all: $(READY)  ## run every test
 	@echo "test-all: pytest, everything"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +20,20 @@ from magnet.testing import random_scene
 @pytest.fixture(scope="session")
 def body() -> Body:
     return load_body("open")
+
+
+@pytest.fixture(scope="session")
+def blender() -> str:
+    """A Python that has Blender as its module `bpy`: this one, or the one that MAGNET_BLENDER names.
+
+    bpy asks for one Python version and an older NumPy than ours, so it mostly lives in an environment of its own.
+    """
+    python = os.environ.get("MAGNET_BLENDER")
+    if python is None:
+        if importlib.util.find_spec("bpy") is None:
+            pytest.skip("needs Blender's bpy: make test-blender, or MAGNET_BLENDER=PYTHON_WITH_BPY")
+        python = sys.executable
+    return python
 
 
 @pytest.fixture

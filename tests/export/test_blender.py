@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +23,6 @@ pytestmark = pytest.mark.slow
 
 FRAMES = (0, 1, 17, 59)
 MILLIMETRE = 1e-3
-
-
-@pytest.fixture(scope="module")
-def blender() -> str:
-    """A Python that has Blender as its module `bpy`: this one, or the one that MAGNET_BLENDER names.
-
-    bpy asks for one Python version and an older NumPy than ours, so it mostly lives in an environment of its own.
-    """
-    python = os.environ.get("MAGNET_BLENDER")
-    if python is None:
-        if importlib.util.find_spec("bpy") is None:
-            pytest.skip("needs Blender's bpy: make test-blender, or MAGNET_BLENDER=PYTHON_WITH_BPY")
-        python = sys.executable
-    return python
 
 
 @pytest.fixture(scope="module")
