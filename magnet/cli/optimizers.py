@@ -62,19 +62,27 @@ def choose_optimizer(model: LightningModule, config: Namespace) -> None:
     model.configure_optimizers = MethodType(configure_optimizers, model)  # type: ignore[method-assign]
 
 
-def refuse_both(flags: Sequence[str], config: Namespace) -> None:
+def refuse_both(flags: Sequence[str], config: Namespace, checkpoint: Any = None) -> None:
     """Refuse options of a model's own optimizer beside another, which would have no say.
+
+    Args:
+        flags: of the command line.
+        config: what is chosen, by the command line, by files of options, or by the run that goes on.
+        checkpoint: the file that a run goes on from, whose optimizer goes on with it.
 
     Raises:
         CommandError: names the first such flag.
     """
     own = r"--model\.(init_args\.)?optimizer[.=]"
     if config.get("optimizer") and (both := next((flag for flag in flags if re.match(own, flag)), None)):
-        name = plain(config["optimizer"])["class_path"].rpartition(".")[2]
-        raise CommandError(
-            f"{both.partition('=')[0]} is of the model's own optimizer, and has no say beside --optimizer {name}: give "
-            "--optimizer.FIELD, such as --optimizer.lr, or leave --optimizer out"
-        )
+        name, flag = plain(config["optimizer"])["class_path"].rpartition(".")[2], both.partition("=")[0]
+        do = "give --optimizer.FIELD, such as --optimizer.lr, or leave --optimizer out"
+        if checkpoint is not None:
+            do = (
+                f"leave {flag} out, for a run goes on with the optimizer that it has; to change that, begin a new run "
+                f"from its weights alone, with --model.start_from {checkpoint} in place of --ckpt_path"
+            )
+        raise CommandError(f"{flag} is of the model's own optimizer, and has no say beside --optimizer {name}: {do}")
 
 
 def plain(chosen: Namespace | dict[str, Any]) -> dict[str, Any]:

@@ -331,7 +331,7 @@ class MagnetCLI(LightningCLI):
 
     def before_fit(self) -> None:
         """Build what a resumed model's sizes depend on: callbacks that copy the model do so before it is loaded."""
-        optimizers.refuse_both(self.request.flags, self.config_init[self.command])
+        optimizers.refuse_both(self.request.flags, self.config_init[self.command], self.checkpoint)
         optimizers.choose_optimizer(self.model, self.config_init[self.command])
         if self.checkpoint is not None and not getattr(self.model, "built", True):
             self.model.on_load_checkpoint(checkpoints.read(self.checkpoint))

@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 import torch
+from jsonargparse import Namespace
 from torch import nn
 
 from magnet import cli
-from magnet.cli.optimizers import optimizer_of
+from magnet.cli.errors import CommandError
+from magnet.cli.optimizers import optimizer_of, refuse_both
 from tests.toys import ToyModel
 
 QUIET = ["--trainer.enable_progress_bar", "false", "--trainer.logger", "false", "--trainer.accelerator", "cpu"]
@@ -48,6 +50,14 @@ def test_options_of_the_models_own_optimizer_are_refused_beside_another(
     words = ["fit", *model, *QUIET, "--optimizer", "SGD", flag]
     assert cli.main([*words, *([] if "=" in flag else ["0.1"])]) == 2
     assert f"{flag.partition('=')[0]} is of the model's own optimizer" in capsys.readouterr().err
+
+
+def test_of_a_run_that_goes_on_nobody_is_told_to_change_the_optimizer() -> None:
+    chosen = Namespace(optimizer=Namespace(class_path="torch.optim.SGD", init_args=Namespace(lr=0.25)))
+    with pytest.raises(CommandError, match=r"beside --optimizer SGD: leave --model\.optimizer\.muon out") as refused:
+        refuse_both(["--model.optimizer.muon=true"], chosen, Path("run/checkpoints/last.ckpt"))
+    assert "leave --optimizer out" not in str(refused.value)
+    assert "--model.start_from run/checkpoints/last.ckpt in place of --ckpt_path" in str(refused.value)
 
 
 def test_without_either_the_models_own_trains(toy: None) -> None:
