@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from magnet.export.cutting import kept_frames
 from magnet.export.rig_motion import RATES, Bools, Floats, RigMotion, rest_of, usual_rate
-from magnet.motion.bvh import AXES, BvhHeader, BvhJoint, bvh_header
+from magnet.motion.bvh import AXES, BvhHeader, BvhJoint, bvh_header, decimal_comma
 from magnet.motion.runs import filled
 
 
@@ -30,11 +31,7 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
             or, without `gaps`, in any. No such frames.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"{path}: no such file") from error
-    lines = text.splitlines()
+    lines = bvh_lines(path)
     header = bvh_header(lines, path)
     joints, parents = _without_ends(header.joints)
     values, tracked = _motion(path, lines, header)
@@ -64,6 +61,24 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
     fps = _rate(header.seconds, header.digits)
     # Cut last: where the root is counted from is told by the whole file.
     return RigMotion(names, parents, offsets, place[kept], local[kept], fps, path, tracked)
+
+
+def bvh_lines(path: Path) -> list[str]:
+    """Lines of a text in UTF-8 or, as some programs on Windows write it, in UTF-16.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{path}: no such file") from error
+    coding = "utf-8-sig"
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        coding = "utf-16"
+    elif b"\0" in raw[:2]:  # without its mark: what begins a BVH is ASCII
+        coding = "utf-16-be" if raw[:1] == b"\0" else "utf-16-le"
+    return raw.decode(coding, errors="replace").splitlines()
 
 
 def _placed(offset: Floats, moved: dict[int, Floats], frames: int, reach: float) -> Floats:
@@ -119,7 +134,8 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> tuple[Floats
     try:
         values = np.array(words, dtype=np.float64).reshape(frames, width)
     except ValueError as error:
-        raise ValueError(f"{path}: the MOTION part holds something that is no number ({error})") from error
+        what = decimal_comma(words) or f"the MOTION part holds something that is no number ({error})"
+        raise ValueError(f"{path}: {what}") from error
     finite: Bools = np.logical_and.reduce(np.isfinite(values), axis=1)
     if finite.all():
         return values, None

@@ -14,7 +14,7 @@ import torch
 from magnet.body import Body
 from magnet.body.joints import ANKLES, COLLARS, HIPS, KNEES
 from magnet.export.bvh import bvh_text, depth_first, euler_zxy, paths_of
-from magnet.export.bvh_read import read_bvh
+from magnet.export.bvh_read import bvh_lines, read_bvh
 from magnet.export.fbx import as_fbx, converted
 from magnet.export.glb import FLOAT, animation, frame_times, packed, standing, unbroken
 from magnet.export.glb_read import GlbRig, in_one_line, read_rig
@@ -182,7 +182,7 @@ def local_of(file: RigMotion, turned: Mapping[int, Floats], frames: int) -> Floa
 
 def _tips(rig: Path) -> dict[int, Floats]:
     """The End Sites of a BVH, by the joint that they end."""
-    header = bvh_header(rig.read_text(encoding="utf-8-sig", errors="replace").splitlines(), rig)
+    header = bvh_header(bvh_lines(rig), rig)
     number = {k: i for i, k in enumerate(k for k, joint in enumerate(header.joints) if not joint.end)}
     return {number[joint.parent]: np.nan_to_num(np.array(joint.offset)) for joint in header.joints if joint.end}
 

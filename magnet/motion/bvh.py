@@ -66,9 +66,8 @@ def bvh_header(lines: Sequence[str], path: object) -> BvhHeader:
     try:
         frames, seconds = int(head["frames"]), float(head["frame time"])
     except (KeyError, ValueError) as error:
-        if re.fullmatch(r"\d*,\d+", said := head.get("frame time", "").strip()):
-            comma = f"Frame Time: {said} has a decimal comma, expected a point as in 0.0333333: mend the file's numbers"
-            raise ValueError(f"{path}:{begin + 3}: {comma}, or export it again with one") from error
+        if comma := decimal_comma([head.get("frame time", "")]):
+            raise ValueError(f"{path}:{begin + 3}: Frame Time: {comma}") from error
         raise ValueError(f"{path}:{begin + 2}: expected the lines 'Frames: N' and 'Frame Time: SECONDS'") from error
     if not 0 < seconds < 10 or frames < 1:
         raise ValueError(f"{path}:{begin + 2}: {frames} frames of {seconds:g} s; expected at least one of 0 to 10 s")
@@ -166,7 +165,14 @@ def _three(where: str, words: Sequence[str]) -> tuple[float, float, float]:
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f"{where}: {error}; expected 3 numbers") from error
+        raise ValueError(f"{where}: {decimal_comma(words) or f'{error}; expected 3 numbers'}") from error
     if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{where}: got {' '.join(words) or 'nothing'}, expected 3 finite numbers")
     return numbers[0], numbers[1], numbers[2]
+
+
+def decimal_comma(words: Sequence[str]) -> str | None:
+    """What to do about the first of many words that is a number with a decimal comma; None: there is none."""
+    word = next((word for word in words if re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", word)), None)
+    point = "expected a point as in 0.0333333: mend the file's numbers, or export it again with points"
+    return None if word is None else f"{word} has a decimal comma, {point}"

@@ -160,6 +160,8 @@ BREAKS = {
     "Frame Time: 0,0333333 has a decimal comma, expected a point": lambda text: re.sub(
         r"Frame Time: \S+", "Frame Time: 0,0333333", text
     ),
+    ":4: 0,0000000 has a decimal comma, expected a point": lambda text: text.replace(".", ","),
+    "0,5 has a decimal comma": lambda text: re.sub(r"\S+\n$", "0,5\n", text),
     "expected the lines 'Frames: N'": lambda text: text.replace("Frames: 20", "Frames: many"),
     "frame 19 holds NaN or infinity; leave such frames out in all": lambda text: re.sub(r"\S+\n$", "nan\n", text),
     "something that is no number": lambda text: re.sub(r"\S+\n$", "1.2.3\n", text),
@@ -180,6 +182,15 @@ def test_blank_lines_may_come_before_the_hierarchy(trio: Scene, body: Body, tmp_
     path.write_text("\n\n" + text.replace("CHANNELS 6 Xposition", "CHANNELS 6 X", 1))
     with pytest.raises(ValueError, match=r":7: CHANNELS 6 X .*: expected 6 of"):
         read_bvh(path)
+
+
+@pytest.mark.parametrize("coding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_a_file_in_utf_16_is_read_as_one_in_utf_8(coding: str, trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    plain = read_bvh(path)
+    path.write_text(path.read_text(), encoding=coding)
+    read = read_bvh(path)
+    assert read.names == plain.names and np.array_equal(read.world()[1], plain.world()[1])
 
 
 @pytest.mark.parametrize("message", BREAKS)
