@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magnet.body.base import Body
 from magnet.export.page.palette import agent_colours
 from magnet.export.page.rig import CROWD, Style, first_style
-from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length
+from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, titled
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
@@ -56,9 +56,9 @@ class Viewer(ViewerBase):
         port: int = 8080,
         render: RenderOptions | None = None,
     ) -> None:
-        takes = numbered(takes)
+        title, takes = titled(takes), numbered(takes)
         render = render or default_render_options(takes)
-        super().__init__(body, render, host, port, takes[0].label if len(takes) == 1 else "magnet")
+        super().__init__(body, render, host, port, title)
         self.clock = Clock(max(each.frames for each in takes), takes[0].scene.fps)
         with self.server.atomic():
             for number, (each, offset) in enumerate(zip(takes, in_a_row(takes), strict=True)):

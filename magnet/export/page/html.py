@@ -21,7 +21,7 @@ from magnet.body.joints import PARENTS
 from magnet.export.page.marks import marked
 from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
 from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
-from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes
+from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes, titled
 from magnet.files import write_text
 from magnet.motion.scene import Scene
 
@@ -48,6 +48,7 @@ def save_html(
         scene: each of its B a take, or takes; several stand side by side, and each can be looked at alone.
         context: first frames, shown paler as given to the model, where the scene does not say which were.
         truth: a scene (B = 1) shown as ghosts in every take; held or cut to their length.
+        title: by default the takes' names, of a scene without one the file's.
         styles: looks to choose from, the first one first. By default body (light bodies of a crowd), capsules and
             skeleton, but no skin of a body that is not the open one: the file would carry a model that its owner may
             not pass on. Name "body" or "light" to have it all the same.
@@ -63,7 +64,9 @@ def save_html(
     if path.suffix.lower() not in ("", ".html"):
         raise ValueError(f"{path}: a page is a .html file")
     path = path if path.suffix else path.with_suffix(".html")
-    return write_text(path, page(scene, body, context=context, truth=truth, title=title, styles=styles))
+    if isinstance(scene, Scene):
+        scene = takes(scene, title or path.stem, context, scene.scenes)
+    return write_text(path, page(scene, body, truth=truth, title=title, styles=styles))
 
 
 def page(
@@ -76,7 +79,8 @@ def page(
     styles: tuple[Style, ...] | None = None,
 ) -> str:
     """What `save_html` writes, for a notebook's inline frame; the same arguments."""
-    shown = numbered(takes(scene, title or "scene", context, scene.scenes) if isinstance(scene, Scene) else list(scene))
+    given = takes(scene, title or "scene", context, scene.scenes) if isinstance(scene, Scene) else list(scene)
+    shown = numbered(given)
     if truth is not None and truth.scenes != 1:
         raise ValueError(f"truth: got {truth.scenes} scenes, expected one: truth.select([b])")
     rates = sorted({each.scene.fps for each in shown})
@@ -92,7 +96,7 @@ def page(
     meta, arrays = _contents(shown, body, ghosts, styles)
     data, meta["arrays"] = _packed(arrays)
     words = {
-        "title": html.escape(title or (shown[0].label if len(shown) == 1 else "magnet")),
+        "title": html.escape(title or titled(given)),
         "meta": json.dumps(meta, separators=(",", ":")).replace("<", "\\u003c"),  # a name may hold <!-- or </script>
         "data": base64.b64encode(data).decode("ascii"),
         "player": "\n".join(_packaged(name) for name in SCRIPTS),

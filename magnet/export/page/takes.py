@@ -21,6 +21,9 @@ APART = 0.5
 WIDEST = 8.0
 """Metres of the row that one take takes up at most."""
 
+BETWEEN = " · "
+"""In a label, between the name of a file and that of a scene in it."""
+
 
 @dataclass(frozen=True)
 class ShownTake:
@@ -85,8 +88,15 @@ def takes(scene: Scene, label: str = "", context: int = 0, samples: int = SAMPLE
     names = [name or label for name in scene.names or [""] * scene.scenes]
     if scene.scenes > 1:
         named = "" not in scene.names and len(set(scene.names)) == scene.scenes
-        names = [f"{label} · {name}" if named else f"{name} · {b + 1}" for b, name in enumerate(names)]
+        names = [f"{label}{BETWEEN}{name}" if named else f"{name}{BETWEEN}{b + 1}" for b, name in enumerate(names)]
     return [take(names[b], scene.select([b]), context) for b in range(min(scene.scenes, samples))]
+
+
+def titled(takes: Sequence[ShownTake], most: int = 3) -> str:
+    """A title for takes: their labels, those of one file once; of many the first, and how many more."""
+    names = list(dict.fromkeys(each.label.partition(BETWEEN)[0] for each in takes))
+    names = [takes[0].label] if len(takes) == 1 else names
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def same_length(one: ShownTake, other: ShownTake) -> Scene:

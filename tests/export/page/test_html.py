@@ -12,7 +12,7 @@ import torch
 from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.page.html import FULL, page, save_html
-from magnet.export.page.takes import take
+from magnet.export.page.takes import ShownTake, take, takes
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -111,6 +111,18 @@ def test_a_licensed_bodys_skin_is_left_out_unless_it_is_asked_for(duet: Scene, b
     assert meta["styles"] == ["capsules", "skeleton"]
     assert not [name for name in arrays if name.startswith("body")]
     assert contents(page(scene, theirs, styles=("body",)))[0]["styles"] == ["body"]
+
+
+def test_a_page_is_titled_by_the_names_of_what_it_shows(duet: Scene, body: Body, tmp_path: Path) -> None:
+    def title(shown: Scene | list[ShownTake]) -> str:
+        text = save_html(shown, tmp_path / "out.html", body, styles=("skeleton",)).read_text(encoding="utf-8")
+        return re.search("<title>(.*?)</title>", text)[1]
+
+    duet = duet.slice(0, 4).replace(names=())
+    assert title(duet) == title(duet.repeat(2)) == "out"
+    assert title(duet.replace(names=("60_04",))) == "60_04"
+    assert title([take("a", duet), *takes(duet.repeat(2), "b"), take("a", duet)]) == "a, b"
+    assert title([take(label, duet) for label in "abcde"]) == "a, b, c and 2 more"
 
 
 FIELDS = ("J_template", "J_shapedirs", "v_template", "shapedirs", "weights", "faces")
