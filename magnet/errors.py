@@ -1,4 +1,4 @@
-"""Errors that many rooms know, a file that somebody else made and the end of the process; and how users are warned."""
+"""Errors that many rooms know, a file that somebody else made and the end of the process; and how users are told."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ def warn_user(message: str) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, stacklevel=level)
+
+
+def counted(number: int, what: str) -> str:
+    """As "1 scene", "2 scenes"."""
+    return f"{number} {what}{'s' * (number != 1)}"
 
 
 class DataError(ValueError):

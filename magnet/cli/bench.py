@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser, taken_out
+from magnet.errors import counted
 
 if TYPE_CHECKING:
     from magnet.denoiser.core import DenoiserCore
@@ -168,8 +169,8 @@ def run(given: argparse.Namespace, of_tasks: Mapping[str, list[str]]) -> dict[st
     wanted = cases(tasks, people, given.batch or usual["batch"], options_of)
     if not wanted:
         raise CommandError(f"none of {', '.join(tasks)} is for {' or '.join(map(str, people))} people")
-    threads = torch.get_num_threads()
-    print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads} threads")
+    threads = counted(torch.get_num_threads(), "thread")
+    print(f"{given.model or 'the default model'}, {options.steps} steps, {options.precision}, {threads}")
     print(row("", list(COLUMNS.values())), flush=True)
     found: dict[str, Any] = {"cases": {}, "live": None}
     for case in wanted:

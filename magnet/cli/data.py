@@ -26,6 +26,7 @@ from magnet.cli.data_shown import (
 )
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser
+from magnet.errors import counted
 
 if TYPE_CHECKING:
     from magnet.body import Body
@@ -201,7 +202,7 @@ def run_info(given: argparse.Namespace) -> int:
     size = sum(file.stat().st_size for file in files if file.is_file())
     out.print(f"{rows:,} frames of one person, {size / 2**20:.1f} MiB; splits by {m['splits by']}")
     if m.get("limit"):
-        out.print(f"a try-out: at most {m['limit']} takes of each split")
+        out.print(f"a try-out: at most {counted(m['limit'], 'take')} of each split")
     show_splits(m["splits"])
     show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
     show_notes([noted(entry["note"], entry["takes"]) for entry in m["notes"]])
@@ -209,7 +210,7 @@ def run_info(given: argparse.Namespace) -> int:
     if m.get("listed but not there"):
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
-        out.print(f"{len(m['left out'])} takes are in no split")
+        out.print(f"in no split: {counted(len(m['left out']), 'take')}")
     show_gaps(m["splits"], "limit" in m)
     return 0
 
@@ -315,7 +316,7 @@ def run_prepare(given: argparse.Namespace) -> int:
         print(f"note: {line}")
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))
-    print(f"{report.made - report.failed} takes converted, {report.kept} kept from an earlier run")
+    print(f"{counted(report.made - report.failed, 'take')} converted, {report.kept} kept from an earlier run")
     show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     show_gaps(m["splits"], "limit" in m)
     takes = sum(split["takes"] for split in m["splits"].values())
@@ -367,9 +368,10 @@ def run_download(given: argparse.Namespace) -> int:
     options |= {} if given.base_url is None else {"base_url": given.base_url}
     with file_bars() as tell, writing(out, "choose another --out; then run the same command again, which goes on"):
         got = download_cmu(subjects, out, progress=tell, **options)
-    print(f"{len(got.fetched)} files fetched, {len(got.kept)} were there, in {got.folder}")
+    print(f"{counted(len(got.fetched), 'file')} fetched, {len(got.kept)} there before, in {got.folder}")
     if got.unlike:
-        print(f"{len(got.unlike)} are not the bytes this project was tested with: {', '.join(got.unlike[:5])}")
+        unlike = counted(len(got.unlike), "file")
+        print(f"{unlike} not of the bytes this project was tested with: {', '.join(got.unlike[:5])}")
     print(f"to train on them: magnet fit --model Tokenizer --data CMU --data.root {shlex.quote(str(out))}")
     return 0
 

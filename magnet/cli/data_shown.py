@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, TextIO
 
 from magnet.cli import answers
+from magnet.errors import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -156,11 +157,11 @@ def why_untrained(manifest: Mapping[str, Any]) -> str | None:
     if manifest["splits"].get("train", {}).get("clips"):
         return None
     counts = {
-        "takes were skipped, as is listed above": len(manifest["skipped"]),
-        "takes are in no split": len(manifest["left out"]),
-        "names of the lists are not in the download": len(manifest["listed but not there"]),
+        ("take", "skipped, as is listed above"): len(manifest["skipped"]),
+        ("take", "in no split"): len(manifest["left out"]),
+        ("name", "of the lists, not in the download"): len(manifest["listed but not there"]),
     }
-    facts = [f"{count} {what}" for what, count in counts.items() if count]
+    facts = [f"{counted(count, what)} {where}" for (what, where), count in counts.items() if count]
     return f"no take that can be used is in train by {manifest['splits by']}" + "".join(f"; {fact}" for fact in facts)
 
 

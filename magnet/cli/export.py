@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
+from magnet.errors import counted
 
 if TYPE_CHECKING:
     from magnet.motion.scene import Scene
@@ -105,7 +106,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         scene = only(scene, options.person)
     if options.context > scene.frames:
         raise CommandError(
-            f"--context {options.context}: got {scene.frames} frames, so at most {scene.frames} were given"
+            f"--context {options.context}: got {counted(scene.frames, 'frame')}; give {scene.frames} or less"
         )
     apart = (options.smplx, options.each, bool(options.rig))
     scene_files.require_unread(out, [*options.inputs, *options.rig], scene_files.slots_of(scene), *apart)
@@ -205,4 +206,4 @@ def described(scene: Scene) -> str:
     count = f"{people[0]}" if len(people) == 1 else f"{people[0]} to {people[-1]}"
     what = f"{scene.scenes} scenes of {count}" if scene.scenes > 1 else count
     who = "person" if people == [1] else "people"
-    return f"{what} {who}, {scene.frames} frames at {scene.fps:g} fps, {scene.frames / scene.fps:.1f} s"
+    return f"{what} {who}, {counted(scene.frames, 'frame')} at {scene.fps:g} fps, {scene.frames / scene.fps:.1f} s"

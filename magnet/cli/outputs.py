@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from magnet.cli.provenance import machine, provenance
+from magnet.errors import counted
 from magnet.evaluation.evaluator import UNALIGNED, Evaluator
 from magnet.evaluation.results import Results, print_table
 from magnet.files import file_word, write_text
@@ -121,11 +122,6 @@ def write_scenes(
     if isinstance(by, Evaluator):
         print(cost(facts["sampling"]))
     print(f"written: {counted(number, 'scene')}{many} to {folder / 'scenes'}")
-
-
-def counted(number: int, what: str) -> str:
-    """As "1 scene", "2 scenes"."""
-    return f"{number} {what}{'s' * (number != 1)}"
 
 
 def file_part(scene: Scene) -> str:

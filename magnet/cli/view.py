@@ -12,6 +12,7 @@ from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 from magnet.cli.named_files import require_there
+from magnet.errors import counted
 from magnet.sampling.presets import PRESETS, preset_name
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
     takes, body = read_takes(options.files, body, options.context, options.samples, how, print)
     longest = max(each.scene.frames for each in takes)
     if options.context > longest:
-        raise ValueError(f"--context {options.context}: got {longest} frames, so at most {longest} were given")
+        raise ValueError(f"--context {options.context}: got {counted(longest, 'frame')}; give {longest} or less")
     return takes, body
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from magnet.errors import counted
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, cat_agents
 
@@ -26,7 +27,7 @@ def kept_frames(path: str | Path, frames: int, start: int, end: int | None) -> s
         )
     for name, frame, most in (("start", start, frames - 1), ("end", end, frames)):
         if frame and frame > most:
-            held = f"holds {frames} frames"
+            held = f"holds {counted(frames, 'frame')}"
             raise ValueError(f"{path}: {held}, so {name} {frame} is behind them; give --{name} {max(most, 0)} or less")
     return slice(start, end)
 
@@ -136,8 +137,8 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
     shortest = min(person.frames for person in people)
     if not trim and any(person.frames != shortest for person in people):
         raise ValueError(
-            f"lengths differ: {_each(labels, [f'{person.frames} frames' for person in people])}; people of one scene "
-            f"share their frames: cut all to the shortest with --trim (trim=True)"
+            f"lengths differ: {_each(labels, [counted(person.frames, 'frame') for person in people])}; people of one "
+            "scene share their frames: cut all to the shortest with --trim (trim=True)"
         )
     people = [person.slice(0, shortest) for person in people]
     valid = None

@@ -53,7 +53,8 @@ def task_of(name: str, said: Mapping[str, Any]) -> Task:
             hint = "; how to sample is said of the model: magnet.load(name, sampler=...)" if of_sampling else ""
             raise ValueError(f"task {name} has no field {field}; {has}{hint}")
     if lacking := [name for name in needed(kind) if name not in said]:
-        raise ValueError(f"task {name} needs {' and '.join(lacking)}, which is not given")
+        unsaid = f"which {'is' if len(lacking) == 1 else 'are'} not given"
+        raise ValueError(f"task {name} needs {' and '.join(lacking)}, {unsaid}")
     task: Task = kind(**said)
     return task
 

@@ -166,7 +166,7 @@ def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
     assert cli.main(["data", "info", "other"]) == 0
     assert cli.main(["data", "check", "other", "--picture", "none"]) == 0
     said = capsys.readouterr().out
-    wanted = "7 names of the lists are not in the download: gone0, gone1, gone2, gone3, gone4 and 2 more"
+    wanted = "not in the download, of the lists: 7 names: gone0, gone1, gone2, gone3, gone4 and 2 more"
     assert said.count(wanted) == 4 and "1 take is in other; 0 were skipped." in said
 
 
@@ -298,7 +298,7 @@ def test_recordings_are_fetched_and_said_where(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(download, "download_cmu", fetch)
     assert cli.main(["data", "download", "cmu", str(tmp_path), "--subjects", "2,60", "--base_url", "http://x"]) == 0
     assert asked == [(["2", "60"], tmp_path, {"base_url": "http://x"})]
-    assert "1 files fetched, 1 were there" in capsys.readouterr().out
+    assert "1 file fetched, 1 there before" in capsys.readouterr().out
 
 
 def test_a_check_of_a_download_does_not_hold_where_a_take_broke_an_assertion(copy, capsys):

@@ -231,3 +231,11 @@ def test_smplx_of_the_open_body_says_what_is_written_and_each_gives_a_file_per_p
     assert cli.main(["export", str(source), str(out), "--each"]) == 2
     assert cli.main(["export", str(files[0]), str(tmp_path / "out.npz"), "--smplx", "--each"]) == 2
     assert "would be one of them" in capsys.readouterr().err
+
+
+def test_one_frame_is_told_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random_scene(1, 1, 1, torch.Generator()).save(tmp_path / "one.npz")
+    assert cli.main(["export", str(tmp_path / "one.npz"), str(tmp_path / "o.npz")]) == 0
+    assert "1 person, 1 frame at 30 fps" in capsys.readouterr().out
+    assert cli.main(["export", str(tmp_path / "one.npz"), str(tmp_path / "p.html"), "--context", "2"]) == 2
+    assert "--context 2: got 1 frame; give 1 or less" in capsys.readouterr().err

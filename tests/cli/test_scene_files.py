@@ -330,7 +330,7 @@ def test_refine_refuses_what_means_nothing(
         (["--up", "q"], "up axis 'q' is for other programs' files"),
         (["--up", "-z"], "up axis '-z' is for other programs' files"),
         (["--context", "-5"], "--context -5: expected 0 frames or more"),
-        (["--context", "13"], "--context 13: got 12 frames, so at most 12 were given"),
+        (["--context", "13"], "--context 13: got 12 frames; give 12 or less"),
     ],
 )
 def test_options_that_a_scene_of_ours_has_no_use_for_are_refused(

@@ -30,3 +30,7 @@ def test_a_field_that_a_task_needs_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(ValueError, match="task needy needs whom, which is not given"):
         task_of("needy", {"target": (1,)})
     assert task_of("needy", {"whom": 0}) == needy(whom=0)
+    needier = dataclasses.make_dataclass("Needier", [("where", int)], bases=(needy,), frozen=True, kw_only=True)
+    monkeypatch.setitem(registry.TASKS.known, "needier", Registered("needier", needier, "strange-tasks 3.1"))
+    with pytest.raises(ValueError, match="task needier needs whom and where, which are not given"):
+        task_of("needier", {"target": (1,)})

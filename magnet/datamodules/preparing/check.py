@@ -26,6 +26,7 @@ from magnet.datamodules.reading.own_files import of_others
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import StoreError, StoreReader, StoreSplit, body_hash
 from magnet.datamodules.store.rows import SCALE, scene_of
+from magnet.errors import counted
 from magnet.export.picture import contact_sheet
 from magnet.files import file_hash
 from magnet.motion.scene import FPS, Scene
@@ -236,7 +237,7 @@ def check_download(
     found.notes += summary_of(reader)
     if use.left_out:
         whose = "the data set's rule" if splits is None else "the list given"
-        found.notes.append(f"{len(use.left_out)} takes are in no split by {whose}")
+        found.notes.append(f"in no split by {whose}: {counted(len(use.left_out), 'take')}")
     if use.absent:
         found.notes.append(absent_note(use.absent))
     notes: dict[str, list[str]] = {}

@@ -18,6 +18,7 @@ from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.fields import first_names
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
+from magnet.errors import counted
 from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
 
 SHARD_ROWS = 2**18
@@ -174,7 +175,7 @@ def summary_of(reader: Reader) -> list[str]:
 
 def absent_note(names: list[str]) -> str:
     """Says which names of the lists the download lacks; perhaps it was not unpacked completely."""
-    return f"{len(names)} names of the lists are not in the download: {first_names(names, 5)}"
+    return f"not in the download, of the lists: {counted(len(names), 'name')}: {first_names(names, 5)}"
 
 
 def read_splits(path: str | Path) -> dict[str, Split]:

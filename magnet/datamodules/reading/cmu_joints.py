@@ -14,6 +14,7 @@ from magnet.body.apart import widened
 from magnet.body.fit import swing
 from magnet.datamodules.reading.asf_amc import AmcRecording, AsfSkeleton, Bools, Floats, euler, together
 from magnet.datamodules.reading.recording import DataError, Recording
+from magnet.errors import counted
 from magnet.motion.rotations import from_rotvec, geodesic, to_quat
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import BODY_JOINTS, FPS
@@ -236,8 +237,8 @@ def measured(recordings: Sequence[AmcRecording], trim: bool = False) -> tuple[Re
         valid.append(~_seen(glitch.masked, recording.frames, recordings[0].fps))
     targets, good = torch.stack(ends, dim=1), torch.stack(valid, dim=1)
     notes = [
-        f"{recording.path.name}: {int(glitch.repaired.sum())} frames are glitches, {int(glitch.masked.sum())} of them"
-        " too long to be interpolated"
+        f"{recording.path.name}: glitches in {counted(int(glitch.repaired.sum()), 'frame')}, "
+        f"{int(glitch.masked.sum())} of them too long to be interpolated"
         for recording, glitch in zip(recordings, glitches, strict=True)
         if glitch.repaired.any()
     ]

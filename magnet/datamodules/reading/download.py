@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 
 from magnet.datamodules.reading.cmu_subjects import folder_of
+from magnet.errors import counted
 from magnet.files import file_hash, write_whole
 
 SITE = "http://mocap.cs.cmu.edu"  # plain: the site's certificate chain is incomplete
@@ -138,8 +139,8 @@ def _refusal(refused: list[str], most: int = 5) -> str:
     listed = "".join(f"\n  {line}" for line in refused[:most])
     more = f"\n  and {len(refused) - most} more" if len(refused) > most else ""
     return (
-        f"{len(refused)} files are not the ones that this project was tested with, and were refused:{listed}{more}\n"
-        "they were changed on their way, or the site has issued them anew: try again, or take them as they are with "
+        f"refused, as not what this project was tested with: {counted(len(refused), 'file')}:{listed}{more}\n"
+        "changed on the way, or the site has issued them anew: try again, or take them as they are with "
         "--any_version"
     )
 
