@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from magnet.datamodules.reading.arrays import AGAIN, Doubles, floats, one_length, open_npz, reported
 from magnet.datamodules.reading.fields import gender_of, shape_numbers
@@ -144,7 +145,7 @@ class ScenesReader(OwnReader[PosedTrack]):
         elif len(betas) != len(poses):
             raise DataError(f"{where}: shape numbers of {len(betas)} people for {len(poses)}; {AGAIN}")
         for p in range(len(poses)):
-            shape, said = (np.zeros(10), ()) if betas is None else shape_numbers(where, {"betas": np.asarray(betas[p])})
+            shape, said = (np.zeros(10), ()) if betas is None else shape_numbers(where, {"betas": _tracked(betas[p])})
             whose = f"{where}, person {p + 1}" if several else where
             (turns, at), tracked, gaps = without_gaps(whose, poses[p, :, :WIDTH], places[p])
             notes.extend((*said, *gaps))
@@ -284,6 +285,15 @@ def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise:
         return otherwise[0]
     has = ", ".join(sorted(map(str, held))[:20]) or "nothing"
     raise DataError(f"{where}: lacks {' or '.join(keys[:2])}; it has {has}; {AGAIN}")
+
+
+def _tracked(betas: Any) -> NDArray[Any]:
+    """Shape numbers without the rows of frames in which there are none; all of them where that would be nothing."""
+    betas = np.asarray(betas)
+    if betas.ndim != 2 or betas.dtype.kind != "f":
+        return betas
+    there = np.isfinite(betas).all(axis=1)
+    return betas[there] if there.any() else betas
 
 
 def _poses(where: str, held: Mapping[str, Any]) -> tuple[Doubles, int]:

@@ -156,8 +156,9 @@ def scene_of(
 
     Also read: every name that `magnet.export.smpl_keys` knows (`trans`, `root_orient` and `pose_body`,
     `global_orient` and `body_pose`, ...), rotations as matrices or joint by joint, more or fewer than ten betas (the
-    first ten count; the median where a person has several rows), no betas (zero). A file that does not name its body
-    is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise, with SMPL-X's mean J0.
+    first ten count; the median where a person has several rows, of those without NaN), no betas (zero). A file that
+    does not name its body is SMPL-X's: its betas are taken if `body` is not the open one, and are zero otherwise, with
+    SMPL-X's mean J0.
     Frames of somebody that hold NaN hold the pose before, and are not valid.
 
     Args:
@@ -190,13 +191,16 @@ def _scene_of(where: str | Path, read: _Held, body: Body, up: str | None, unit: 
     of_smplx = OWN_SHAPE in arrays or (written_for is None and is_open(body))  # transl is, betas are not
     if poses.ndim == 2:
         poses, transl, betas = poses[None], transl[None], betas[None]
-    if betas.ndim == 3 and betas.shape[1]:  # a row a frame, or one for all
-        betas = betas.quantile(0.5, dim=1)
+    if betas.ndim == 3 and betas.shape[1]:  # a row a frame, where it was tracked, or one for all
+        whole = betas.isfinite().all(dim=-1, keepdim=True)
+        betas = betas.where(whole, torch.nan).nanquantile(0.5, dim=1)
     P, T = poses.shape[:2]
     fits = poses.ndim == 3 and P > 0 and poses.shape[-1] >= 3 * BODY_JOINTS and transl.shape == (P, T, 3)
     if not fits or betas.ndim != 2 or len(betas) != P:
         shapes = f"poses {tuple(poses.shape)}, transl {tuple(transl.shape)}, betas {tuple(betas.shape)}"
         raise ValueError(f"{where}: got {shapes}, expected (P, T, 66 or more), (P, T, 3), (P, 10) of P people")
+    if not bool(betas.isfinite().all()):
+        raise ValueError(f"{where}: betas: expected finite numbers")
     betas = torch.nn.functional.pad(betas[:, :10], (0, max(0, 10 - betas.shape[1])))
     poses, transl, valid = _without_gaps(where, poses[..., : 3 * BODY_JOINTS], transl)
     if written_for is None and is_open(body):
@@ -333,9 +337,8 @@ def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) ->
     if SCALE in there:
         arrays["transl"] = arrays["transl"] / _number(where, SCALE, held, "by which translations are divided")
     fps = _rate(where, held, in_fps)
-    bad = [name for name, array in arrays.items() if name in ("betas", OWN_SHAPE) and not np.isfinite(array).all()]
-    if bad or not 0 < fps < float("inf"):
-        raise ValueError(f"{where}: {', '.join(bad) or 'mocap_frame_rate'}: expected finite numbers")
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"{where}: mocap_frame_rate: expected a finite number over 0")
     tensors = {name: torch.from_numpy(array.astype(np.float64)) for name, array in arrays.items()}
     if ours and "given" in there:
         given, expected = np.asarray(held["given"]), arrays["poses"].shape[:-1]

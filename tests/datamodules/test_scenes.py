@@ -146,6 +146,15 @@ def test_frames_of_no_numbers_are_not_tracked_and_the_others_stay_as_they_are(
     assert "4 of 40 frames hold NaN or infinity, taken as not tracked: cut out" in note
 
 
+def test_shapes_of_lost_frames_do_not_count(tmp_path: Path) -> None:
+    held = {key: np.array(value) for key, value in plain(0).items()}
+    shape = held["betas"]
+    held["betas"] = np.tile(shape, (TRUE.frames, 1))
+    held["betas"][GONE] = held["trans"][GONE] = np.nan
+    write(tmp_path / "walk.pkl", held)
+    np.testing.assert_allclose(read(tmp_path).betas[0], shape[:10])
+
+
 def test_both_kinds_of_npz_that_magnet_writes_come_back(tmp_path: Path) -> None:
     body = load_body()
     scene = made()

@@ -182,6 +182,16 @@ def test_numbers_that_are_none_are_refused(trio: Scene, body: Body, tmp_path: Pa
         load_smplx(tmp_path / "none.npz", body)
 
 
+def test_shapes_of_lost_frames_do_not_count(tmp_path: Path) -> None:
+    rows = np.arange(50.0).reshape(5, 10)
+    rows[3, 4], rows[1] = np.inf, np.nan
+    body = Body(**{**vars_of(load_body()), "id": "smplx-neutral"})
+    held = {"poses": np.zeros((5, 66)), "transl": np.zeros((5, 3)), "mocap_frame_rate": 30.0}
+    assert scene_of("a.npz", {**held, "betas": rows}, body)[0].betas[0, 0].tolist() == rows[2].tolist()
+    with pytest.raises(ValueError, match=r"a\.npz: betas: expected finite numbers"):
+        scene_of("a.npz", {**held, "betas": rows * np.nan}, body)
+
+
 def scaled(tmp_path: Path, metres: float = 1.0, radians: float = 1.0) -> Path:
     """Somebody walking, as other programs write it, with lengths and turns times a factor."""
     scene = synthesize("circle", 2, 120, torch.Generator().manual_seed(0), load_body()).scene.permute_agents(
