@@ -83,7 +83,8 @@ class ViewerBase:
         """Buttons of the clock, and its slider below the tracks of the people."""
         gui = self.server.gui
         people = sum(len(view.take.slots) for view in self.views)
-        self.timeline = Timeline(self.server, self.clock.frames, min(people, TRACKS))
+        rows = min(people, TRACKS + 1)  # the last one says how many have no track
+        self.timeline = Timeline(self.server, self.clock.frames, rows)
         self.slider = self.timeline.slider
         with gui.add_folder("Time"):
             self.play = gui.add_button("Pause", icon="player-pause")
@@ -279,7 +280,7 @@ class ViewerBase:
         frames = np.arange(self.clock.frames)  # of the longest take; the others stay as they were in their last one
         known = [view.take.known[frames.clip(max=len(view.take.known) - 1)] for view in self.views]
         own = np.concatenate([view.own for view in self.views])
-        return Tracks(np.concatenate(known, axis=1)[:, :TRACKS], own[:TRACKS])
+        return Tracks(np.concatenate(known, axis=1)[:, :TRACKS], own[:TRACKS], hidden=max(len(own) - TRACKS, 0))
 
     def places_in_sight(self, frame: int) -> Array:
         """Points to keep visible: everybody's pelvis on the stage. -> (M, 3)"""

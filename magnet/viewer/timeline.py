@@ -28,11 +28,13 @@ class Tracks:
         known: (T, P) bool, frames that were given.
         colours: (P, 3) of the people.
         keys: keyframes as (person, frame).
+        hidden: how many more people there are, without tracks.
     """
 
     known: NDArray[np.bool_]
     colours: Colours
     keys: tuple[tuple[int, int], ...] = ()
+    hidden: int = 0
 
     @property
     def frames(self) -> int:
@@ -69,8 +71,13 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
         left = 100 * second * fps / frames
         parts.append(f'<text x="{left:.2f}%" y="{height + 9}" font-size="10" fill="#8a92a3">{second} s</text>')
     bar(now, now + max(frames / 500, 0.4), 0, height, NOW)
+    tall = height + 12
+    if tracks.hidden:
+        said = f"of the first {people} of {people + tracks.hidden} people"
+        parts.append(f'<text x="100%" y="{tall + 9}" font-size="10" fill="#8a92a3" text-anchor="end">{said}</text>')
+        tall += TRACK
     return (
-        f'<div style="padding:6px {EDGE}px 0"><svg width="100%" height="{height + 12}" '
+        f'<div style="padding:6px {EDGE}px 0"><svg width="100%" height="{tall}" '
         f'role="img" aria-label="timeline">{"".join(parts)}</svg></div>'
     )
 

@@ -48,6 +48,21 @@ def test_each_person_has_a_track_of_given_and_generated_frames_and_keyframes() -
     assert re.findall(r'<svg x="([\d.]+)%"', svg) == ["99.00"]
 
 
+@pytest.mark.parametrize(("people", "said"), [(8, []), (9, ["of the first 8 of 9 people"])])
+def test_people_without_a_track_are_told(people: int, said: list[str], body) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    viewer = Viewer([take("crowd", random_scene(1, 6, people, torch.Generator().manual_seed(1)))], body, port=0)
+    try:
+        tracks = viewer.tracks()
+    finally:
+        viewer.stop()
+    assert tracks.known.shape == (6, 8) and len(tracks.colours) == 8
+    texts = [text.text for text in ElementTree.fromstring(drawn(tracks, now=0, fps=30.0)).iter("text")]
+    assert [text for text in texts if "people" in text] == said
+
+
 def test_the_timeline_is_as_wide_as_the_picture_and_nothing_happens_while_nobody_looks(body) -> None:
     pytest.importorskip("viser")
     from magnet.viewer.watch import Viewer
