@@ -37,14 +37,17 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         What to call the place in messages; and what is there: of one person, or of several along the first axis.
 
     Raises:
-        DataError: nobody's motion is in it.
+        DataError: nobody's motion is in it, or two of one name.
     """
     if isinstance(held, np.ndarray) and held.dtype == object:
         held = held.item() if held.ndim == 0 else held.tolist()
     if isinstance(held, list | tuple):
         held = {f"person{p + 1}": one for p, one in enumerate(held)}
     if isinstance(held, Mapping):
-        held = {str(key) if isinstance(key, int | np.integer) else key: value for key, value in held.items()}
+        numbers = {key: str(key) for key in held if isinstance(key, int | np.integer)}
+        if twice := [key for key, name in numbers.items() if name in held]:
+            raise DataError(f"{path}: has two people {twice[0]}, one by number and one by text; rename one")
+        held = {numbers.get(key, key): value for key, value in held.items()}
     held = mapping(path, held)
     if is_posed(held):
         yield str(path), held

@@ -16,6 +16,7 @@ from magnet.datamodules.reading.recording import DataError
 from magnet.datamodules.scenes import ScenesReader
 from magnet.export.npz import read_smplx
 from magnet.export.smpl_keys import Unreadable, rotations
+from magnet.export.smpl_people import PERSON, people_in
 
 TRUE = people(40, 1, 30.0, 3)
 WIDTHS = {"body": 66, "smpl": 72, "smplh": 156, "smplx": 165}
@@ -163,6 +164,14 @@ def test_few_frames_before_people_are_refused_where_shapes_or_genders_say_how_ma
         rotations("file", {"poses": poses} | told)
     square = np.stack([vectors(72)[:2]] * 2)
     assert rotations("file", {"poses": square} | told).shape == (2, 2, 72)
+
+
+def test_people_by_number_and_by_the_same_number_as_text_are_refused() -> None:
+    one = {"poses": vectors(66), "trans": np.zeros((40, 3)), "mocap_framerate": 30.0}
+    assert [who[PERSON] for _, who in people_in(Path("a.pkl"), {0: one, "1": one})] == ["0", "1"]
+    for number in (0, np.int64(0)):
+        with pytest.raises(DataError, match=r"a\.pkl: has two people 0, one by number and one by text; rename one"):
+            list(people_in(Path("a.pkl"), {number: one, "0": one}))
 
 
 def test_shape_numbers_of_each_frame_of_one_person_are_not_taken_for_people() -> None:
