@@ -294,7 +294,7 @@ class Model:
         """Sample any task with its options `fields`; `magnet tasks` lists both.
 
         Whoever the task does not make is as recorded where the scene goes on, and else stands still. Given frames that
-        are marked as not valid are read as they are, with a warning.
+        are marked as not valid are read as they are, with a warning, and stay marked.
 
         Args:
             context: frames given of everybody at the start, a multiple of 4.
@@ -316,14 +316,14 @@ class Model:
         if frames < 1:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
         plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
-        if bool((bad := given_invalid(plain, plan.known)).any()):
+        if bool((bad := given_invalid(plain, plan.known).any(dim=0)).any()):
             first = int(bad.nonzero()[0])
             warn_user(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid")
         named = chosen.named(len(plan.known)) if isinstance(chosen, Inbetweening) else []
         if within := [step for step in named if 0 <= step * TOKEN_FRAMES < context]:
             warn_user(f"context={context}: in it lie the keyframes at token steps {within}")
         made = self.sample(scene, chosen, context, frames, seed=seed, samples=samples, cond=cond)
-        return Motion.of(completed(made.plain(), plain.to("cpu"), ~plan.finished), body)
+        return Motion.of(completed(made.plain(), plain.to("cpu"), plan.known, ~plan.finished), body)
 
     def sample(
         self,

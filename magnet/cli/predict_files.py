@@ -175,7 +175,7 @@ def main(arguments: Sequence[str]) -> int:
     from magnet.export import formats
     from magnet.generation.unmade import completed
 
-    given, plain = lead + made.context, completed(made.plain(), files, unmade, lead)
+    given, plain = lead + made.context, completed(made.plain(), files, plan.known, unmade, lead)
     if plain.scenes > 1 and scene.scenes == 1:
         plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
     look: dict[str, Any] = {"style": options.style, "size": size, "context_frames": given}

@@ -69,7 +69,7 @@ def said_of_invalid(scene: Scene, known: Tensor, lead: int) -> list[str]:
     """
     from magnet.generation.unmade import given_invalid
 
-    bad = given_invalid(scene, known).nonzero()[:, 0]
+    bad = given_invalid(scene, known).any(dim=0).nonzero()[:, 0]
     if not len(bad):
         return []
     first, last = lead + int(bad[0]), lead + int(bad[-1])

@@ -16,15 +16,17 @@ def sound(recorded: Scene) -> Tensor:
     return there if recorded.valid is None else there & recorded.valid
 
 
-def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Scene:
+def completed(made: Scene, recorded: Scene, known: Tensor, unmade: Tensor, lead: int = 0) -> Scene:
     """What a model made, with the recording of whoever it did not make, and the recorded frames in front.
 
     The recording is put in now, after sampling, which must not know of it. Whoever has no recording (any more) stands
-    still in the last recorded pose. All that was not made is marked as given, so that pictures show it so.
+    still in the last recorded pose. All that was not made is marked as given, so that pictures show it so. Given frames
+    that are not valid stay marked as that.
 
     Args:
         made: S samples of each of B scenes, T frames.
         recorded: the B scenes that it goes on from.
+        known: (N, P) bool, token steps of people that the task reads.
         unmade: (N, P) bool, token steps of people that the task neither reads nor makes.
         lead: frames of `recorded` before the first frame of `made`.
 
@@ -32,6 +34,7 @@ def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Sc
         B * S scenes of lead + T frames.
     """
     recorded = recorded.to_float32().repeat(made.scenes // recorded.scenes)
+    made = made.replace(valid=_still_valid(recorded, known, lead, made.frames))
     where = unmade.repeat_interleave(TOKEN_FRAMES, dim=0)[: made.frames] & made.present[:, None]
     if bool(where.any()):
         last = torch.where(sound(recorded), torch.arange(recorded.frames), -1).cummax(dim=1).values  # (B S, T')
@@ -47,10 +50,20 @@ def completed(made: Scene, recorded: Scene, unmade: Tensor, lead: int = 0) -> Sc
     return cat_time([front.replace(given=front.present[:, None].expand(-1, lead, -1)), made])
 
 
+def _still_valid(recorded: Scene, known: Tensor, lead: int, frames: int) -> Tensor | None:
+    """Which of so many frames behind the first `lead` count: all but given ones that do not. -> (B, T); None: all"""
+    if recorded.valid is None:
+        return None
+    valid = torch.ones(recorded.scenes, frames, dtype=torch.bool)
+    bad = given_invalid(recorded.slice(lead), known)[:, :frames]
+    valid[:, : bad.shape[1]] = ~bad
+    return None if bool(valid.all()) else valid
+
+
 def given_invalid(scene: Scene, known: Tensor) -> Tensor:
-    """In which frames something is given that is marked as not valid: not tracked, or made up. known (N, P) -> (T,)"""
+    """In which frames something is given that is not valid: not tracked, or made up. known (N, P) -> (B, T)"""
     frames = min(scene.frames, known.shape[0] * TOKEN_FRAMES)
     if scene.valid is None:
-        return torch.zeros(frames, dtype=torch.bool)
-    read = known.to(scene.device).repeat_interleave(TOKEN_FRAMES, dim=0)[:frames] & scene.present.any(dim=0)
-    return (~scene.valid[:, :frames]).any(dim=0) & read.any(dim=1)
+        return torch.zeros(scene.scenes, frames, dtype=torch.bool)
+    read = known.to(scene.device).repeat_interleave(TOKEN_FRAMES, dim=0)[:frames]
+    return ~scene.valid[:, :frames] & (read & scene.present[:, None]).any(dim=-1)

@@ -123,6 +123,7 @@ def test_given_frames_that_are_not_valid_are_said(duet, tmp_path, capsys) -> Non
     words = ("--context", "40", "--frames", "8", "--out", str(tmp_path / "o.npz"))
     text = said(capsys, file, *words, *QUICK)
     assert "of what is given, 2 frames from 36 to 37 are marked as not valid" in text
+    assert (~Scene.load(tmp_path / "o.npz").valid[0]).nonzero()[:, 0].tolist() == [36, 37], "and stay so"
     assert "not valid" not in said(capsys, *duet["ours"], *words, *QUICK)
 
 
