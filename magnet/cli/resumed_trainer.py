@@ -31,10 +31,9 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
     Raises:
         CommandError: a damaged file, or a class in it that nobody here has named.
     """
-    file = checkpoint.parent.parent / "config.yaml"
-    if not (file.is_file() and file.with_name("run.json").is_file()):
+    file, said = _run_of(checkpoint)
+    if not said:
         return {}
-    said = read_layers(str(file))[-1].options
     known = inspect.signature(Trainer.__init__).parameters
     trainer = {key: value for key, value in (said.get("trainer") or {}).items() if key in known and value is not None}
     files = [config.get("trainer") or {} for config in given.configs]
@@ -52,21 +51,34 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
     return layer
 
 
+def _run_of(checkpoint: Path) -> tuple[Path, dict[str, Any]]:
+    """Where the options of the run lie that a checkpoint is of, and what they are; of a checkpoint alone nothing."""
+    file = checkpoint.parent.parent / "config.yaml"
+    there = file.is_file() and file.with_name("run.json").is_file()
+    return file, read_layers(str(file))[-1].options if there else {}
+
+
 class SameCallbacks(Callback):
     """Says which callbacks a training goes on without, and refuses to go on from an average of weights.
 
     Args:
-        checkpoint: the file, for messages.
+        checkpoint: the file that it goes on from; None: it begins.
     """
 
-    def __init__(self, checkpoint: Any) -> None:
+    def __init__(self, checkpoint: Path | None) -> None:
         self.checkpoint = checkpoint
+        options = {} if checkpoint is None else _run_of(checkpoint)[1]  # now, for a run that goes on writes its own
+        said = (options.get("trainer") or {}).get("callbacks") or []
+        asked = said if isinstance(said, list) else [said]
+        paths = [each.get("class_path", "") if isinstance(each, dict) else str(each) for each in asked]
+        self.asked = {path.rpartition(".")[2] for path in paths}  # those without a state, too
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         present: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         states = (checkpoint.get("callbacks", {}), [each.state_key for each in present])
         had, has = ({key.partition("{")[0] for key in keys} for keys in states)
-        lost = sorted(had - has - set(BY_OPTIONS))
+        here = has | {type(each).__name__ for each in present}
+        lost = sorted((had | self.asked) - here - set(BY_OPTIONS))
         if AVERAGE in checkpoint and not any(isinstance(each, WeightAveraging) for each in present):
             raise CommandError(
                 f"{self.checkpoint} is of a run that averages its weights ({', '.join(lost)}), and would go on from "

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from magnet import cli
 
 FIT = ["fit", "--model", "ToyModel", "--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false"]
-EMA, COUNTS = "magnet.training.ema.WeightEMA", f"{__name__}.Counts"
+EMA, COUNTS, SILENT = "magnet.training.ema.WeightEMA", f"{__name__}.Counts", f"{__name__}.Silent"
 
 
 class Counts(Callback):
@@ -19,6 +19,10 @@ class Counts(Callback):
 
     def state_dict(self) -> dict[str, int]:
         return {"seen": 3}
+
+
+class Silent(Callback):
+    """Without a state."""
 
 
 def callbacks(*paths: str) -> list[str]:
@@ -40,3 +44,12 @@ def test_a_run_goes_on_without_callbacks_only_where_that_is_said_and_never_from_
         warnings.simplefilter("always")
         assert cli.main([*more, "2", "--out", "run"]) == 0, "callbacks are those of the run"
     assert not [each for each in said if "goes on without" in str(each.message)]
+
+
+@pytest.mark.parametrize(("sign", "out"), [("+", "run"), ("", "other")])
+def test_a_callback_without_a_state_that_is_left_out_is_told_too(toy: Path, sign: str, out: str) -> None:
+    first = [f"--trainer.callbacks{sign}", SILENT]
+    assert cli.main([*FIT, "--trainer.max_epochs", "1", "--out", "run", *first]) == 0
+    more = [*FIT, "--ckpt_path", "run/checkpoints/last.ckpt", "--trainer.max_epochs", "2", "--out", out]
+    with pytest.warns(UserWarning, match="goes on without Silent, with which run/checkpoints/last.ckpt was trained"):
+        assert cli.main([*more, *callbacks(COUNTS)]) == 0
