@@ -25,7 +25,7 @@ from magnet.sampling.noise import add_noise
 from magnet.seeding import derive, step_generator
 from magnet.training import origins
 from magnet.training.optim import warmup_cosine
-from magnet.training.validation import log_means
+from magnet.training.validation import log_means, of_one_size, places_of
 
 
 class Denoiser(DenoiserCore, TokenModel):
@@ -125,15 +125,17 @@ class Denoiser(DenoiserCore, TokenModel):
     def validation_step(self, batch: Scene, batch_idx: int) -> None:
         # The same noise at every validation, in whatever batches and processes: epochs and runs can be compared.
         generator = torch.Generator(device=self.device).manual_seed(derive(self.hparams["seed"], "validation"))
-        world, first = self.trainer.world_size, self.validated
-        self.places = [(first + b) * world + self.global_rank for b in range(batch.scenes)]
+        places = places_of(self, batch, self.validated)
         self.validated += batch.scenes
+        # Means over pairs weigh by people where all scenes have as many; processes must run shards equally often.
+        alike = [list(range(batch.scenes))] if is_sharded(self.transformer) else of_one_size(batch)
         try:
-            losses = self.losses(batch, generator)
+            for rows in alike:
+                part, self.places = batch.select(rows), [places[b] for b in rows]
+                losses = self.losses(part, generator)
+                log_means(self, {f"val/{name}": value for name, value in losses.items()}, part)
         finally:
             self.places = ()
-        logged = {f"val/{name}": value for name, value in losses.items()}
-        log_means(self, logged, batch)
 
     def _inputs(self, scene: Scene, made: Tensor | None) -> dict[str, Tensor]:
         """What `losses` depends on in a training step, as tensors; `losses_of` takes it."""

@@ -26,7 +26,7 @@ from magnet.tasks.base import Task, schedule_of
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
-from magnet.training.validation import log_means
+from magnet.training.validation import log_means, places_of
 
 
 class Peer(TokenModel):
@@ -56,6 +56,7 @@ class Peer(TokenModel):
         super().__init__()
         if max_agents != 2:
             raise ValueError(f"max_agents: got {max_agents}, but {type(self).__name__} is a model of two people")
+        self.validated = 0  # scenes of this process in the validation that is going on
         self.network, self.optimizer = group_of(PeerNetwork, network), group_of(OptimizerOptions, optimizer)
         sizes = {"tokenizer": tokenizer, "max_agents": max_agents, "window": window, "seed": seed}
         self.save_hyperparameters(plain({**sizes, "network": self.network, "optimizer": self.optimizer}))
@@ -126,11 +127,15 @@ class Peer(TokenModel):
         self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes, sync_dist=True)
         return losses["loss"]
 
+    def on_validation_epoch_start(self) -> None:
+        self.validated = 0
+
     def validation_step(self, batch: Scene, batch_idx: int) -> None:
-        seed = derive(self.hparams["seed"], "validation", batch_idx, self.global_rank)
-        losses = self.losses(batch, torch.Generator(device=self.device).manual_seed(seed))
-        logged = {f"val/{name}": value for name, value in losses.items()}
-        log_means(self, logged, batch)
+        for b, place in enumerate(places_of(self, batch, self.validated)):  # a scene's noise is its own
+            one, seed = batch.select([b]), derive(self.hparams["seed"], "validation", place)
+            losses = self.losses(one, torch.Generator(device=self.device).manual_seed(seed))
+            log_means(self, {f"val/{name}": value for name, value in losses.items()}, one)
+        self.validated += batch.scenes
 
     def errors_of(self, made: Tensor, truth: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """`token_losses` of tokens of one person beside the other. made, truth (M, N, D), counts (M, N) bool"""

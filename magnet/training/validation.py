@@ -16,6 +16,20 @@ def frames_of_people(scene: Scene) -> int:
     return int((scene.present.sum(dim=1) * valid).sum())
 
 
+def of_one_size(scene: Scene) -> list[list[int]]:
+    """Which of the B scenes have as many people as each other, fewest first."""
+    people = scene.present.sum(dim=1).tolist()
+    return [[b for b, count in enumerate(people) if count == size] for size in sorted(set(people))]
+
+
+def places_of(module: LightningModule, batch: Scene, validated: int) -> list[int]:
+    """Which scenes of all that are validated a batch's are, whoever shares a batch or a process.
+
+    validated: scenes of this process before it
+    """
+    return [(validated + b) * module.trainer.world_size + module.global_rank for b in range(batch.scenes)]
+
+
 def log_means(module: LightningModule, losses: Mapping[str, Tensor], batch: Scene) -> None:
     """Log a batch's losses, which are means over the frames of people that count, for means over all batches."""
     # Lightning averages weights over processes in whole numbers, and what is left over is lost: here nothing is.

@@ -7,6 +7,7 @@ import torch.multiprocessing as mp
 
 import magnet
 from magnet import checkpoints
+from magnet.datamodules.clip import Clip
 from magnet.denoiser.module import Denoiser
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene
@@ -221,9 +222,9 @@ def test_what_is_validated_does_not_depend_on_who_shares_a_batch(tmp_path, monke
     assert found == pytest.approx([found[0]] * 3, rel=1e-5)
 
 
-def validated(size: int, **where) -> float:
-    """The loss over windows of couples, in batches of `size`."""
-    clips = [random_clip(f"couple{i}", 100, split="val") for i in range(3)]
+def validated(size: int, clips: list[Clip] | None = None, **where) -> float:
+    """The loss over windows, by default of couples, in batches of `size`."""
+    clips = clips or [random_clip(f"couple{i}", 100, split="val") for i in range(3)]
     given = FakeData(clips, window_frames=32, max_agents=2, val_batch_size=size)
     model = tiny_denoiser(window=8)
     return trainer(1, limit_val_batches=None, **where).validate(model, given, verbose=False)[0]["val/loss"]
@@ -235,7 +236,8 @@ def one_of_two(rank: int, port: int, folder: str) -> None:
 
 
 def test_a_scene_is_validated_with_the_same_noise_in_any_batch():
-    assert [validated(size) for size in (2, 5, 100)] == pytest.approx([validated(1)] * 3, rel=1e-5)
+    for clips in (None, couples_and_singles("val")):  # a batch's pairs do not weigh as its people do
+        assert [validated(size, clips) for size in (2, 5, 100)] == pytest.approx([validated(1, clips)] * 3, rel=1e-5)
 
 
 @pytest.mark.slow

@@ -82,6 +82,16 @@ def sampled(model: Peer, scene: Scene, task: str, seed: int = 0) -> Scene:
     return model.sample(scene, known_of(task), CONTEXT + HORIZON, SAMPLES, sources(seed))
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_scene_is_validated_with_the_same_noise_in_any_batch(name: str, trained: dict[str, Peer]) -> None:
+    found = []
+    for size in (1, 3, 100):
+        clips = [random_clip(f"{k}", 70 + 30 * k, split="val") for k in range(3)]
+        data = FakeData(clips, window_frames=24, val_batch_size=size)
+        found.append(Trainer(**QUIET).validate(trained[name], data, verbose=False)[0]["val/loss"])
+    assert found == pytest.approx([found[0]] * 3, rel=1e-5)
+
+
 def test_every_configured_peer_is_here() -> None:
     assert set(NAMES) == set(TASKS)
 
