@@ -14,7 +14,7 @@ from magnet.body import Body, load_body
 from magnet.body.floor import open_body
 from magnet.checks import require_whole, slots_of
 from magnet.denoiser.core import DenoiserCore
-from magnet.errors import warn_user
+from magnet.errors import counted, warn_user
 from magnet.export import reading
 from magnet.export.motion import Motion, NotebookView
 from magnet.generation.crowd import generate_crowd
@@ -317,8 +317,9 @@ class Model:
             raise ValueError(f"the scene's {scene.frames} frames leave none to sample after {context} of context")
         plan = plan_of_scene(self.denoiser, chosen, slots, context, frames, self.sampler)
         if bool((bad := given_invalid(plain, plan.known).any(dim=0)).any()):
-            first = int(bad.nonzero()[0])
-            warn_user(f"the scene: {int(bad.sum())} given frames, frame {first} first, are not valid")
+            first, count = int(bad.nonzero()[0]), int(bad.sum())
+            which = f"frame {first}, is" if count == 1 else f"frame {first} first, are"
+            warn_user(f"the scene: {counted(count, 'given frame')}, {which} not valid")
         named = chosen.named(len(plan.known)) if isinstance(chosen, Inbetweening) else []
         if within := [step for step in named if 0 <= step * TOKEN_FRAMES < context]:
             warn_user(f"context={context}: in it lie the keyframes at token steps {within}")

@@ -174,10 +174,10 @@ def test_blocks_may_be_as_long_as_the_models_window(duet: Scene):
 
 
 def test_given_frames_that_are_not_valid_are_warned_of(model: Model, duet: Scene):
-    valid = torch.ones(1, 50, dtype=torch.bool)
-    valid[0, 8:10] = valid[0, 40] = False
-    with pytest.warns(UserWarning, match="2 given frames, frame 8 first, are not valid"):
-        model.predict(duet.replace(valid=valid), "joint_future", context=16, frames=8, seed=1)
+    for bad, said in (([8, 9, 40], "2 given frames, frame 8 first, are"), ([8, 40], "1 given frame, frame 8, is")):
+        valid = torch.ones(1, 50, dtype=torch.bool).index_fill(1, torch.tensor(bad), False)
+        with pytest.warns(UserWarning, match=f"{said} not valid"):
+            model.predict(duet.replace(valid=valid), "joint_future", context=16, frames=8, seed=1)
 
 
 def test_keyframes_that_lie_in_the_context_are_warned_of(model: Model, duet: Scene):
