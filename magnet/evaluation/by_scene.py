@@ -148,7 +148,7 @@ class Difference(NamedTuple):
     """second - first"""
     low: float
     high: float
-    """Its interval; NaN with fewer than two units."""
+    """Its interval; NaN where one of both, or of recordings that decide, has numbers of fewer than two units."""
     better: int | None
     """0 or 1: the first or the second is better, in almost all resamples; None: cannot be told."""
     truth: float = math.nan
@@ -181,7 +181,7 @@ def compared(
     sums = sums[(sums[..., 1] > 0).any(axis=1)]
     means = _means(sums.sum(axis=0))
     recorded = means[2] if real else math.nan
-    if len(sums) < 2 or np.isnan(means).any():
+    if (sums[..., 1] > 0).sum(axis=0).min() < 2:  # what one unit alone has is the same in every resample
         return Difference(means[0], means[1], means[1] - means[0], math.nan, math.nan, None, recorded)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(sums), (RESAMPLES, len(sums)), generator=generator).numpy()

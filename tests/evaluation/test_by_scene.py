@@ -103,6 +103,19 @@ def test_a_scene_counts_where_one_of_both_has_something_in_it() -> None:
     assert math.isnan(found.second) and math.isnan(found.low) and found.better is None
 
 
+def test_what_one_scene_alone_has_is_not_sure() -> None:
+    """Every resample with that scene in it has the same value, as if it were known exactly."""
+    both = values(a=drawn(), b=drawn() + 9, truth=drawn())
+    both.rows["b"]["m"][1:, 1] = 0
+    both.rows["c"] = {"m": np.stack([drawn() + 9, np.arange(SCENES) < 2], axis=1)}
+    alone = compared(both, both, ("a", "b"), "m", "low", "truth")
+    assert alone.second == pytest.approx(drawn()[0] + 9)
+    assert math.isnan(alone.low) and alone.better is None
+    assert compared(both, both, ("b", "a"), "m", "low", "truth").better is None
+    assert compared(both, both, ("a", "c"), "m", "real", "b").better is None
+    assert compared(both, both, ("a", "c"), "m", "low", "truth").better == 0
+
+
 def test_a_scene_in_which_a_metric_has_no_number_does_not_count() -> None:
     some = np.array([np.nan, 1.0, 2.0])
     scenes = values(a=some, b=some + 1)
