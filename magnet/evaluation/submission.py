@@ -123,7 +123,7 @@ def _require_facts(path: Path, read: dict[str, Any], benchmark: Benchmark) -> No
         raise ValueError(f"{path}: task: got {str(read['task'])!r}, expected one of {known}")
     fps = read["fps"]
     if fps.size != 1 or fps.dtype.kind not in "iuf" or not abs(float(fps.item()) - benchmark.fps) <= 1e-6:
-        raise ValueError(f"{path}: fps: got {fps.tolist()}, expected {benchmark.fps:g}; resample the joints to it")
+        raise ValueError(f"{path}: fps: got {fps.tolist()!r}, expected {benchmark.fps:g}; resample the joints to it")
 
 
 def _require_scenes(path: Path, names: Sequence[str], expected: Sequence[str]) -> None:
@@ -158,8 +158,8 @@ def _joints(path: Path, joints: Any, benchmark: Benchmark, task: str) -> Tensor:
     if bad.any():
         scene, sample, frame, person = (int(each) for each in np.argwhere(bad)[0])
         raise ValueError(
-            f"{path}: joints: not a number in scene {scene}, sample {sample}, frame {frame}, person {person}, who is "
-            f"scored in {task}; {int(bad.sum())} such places"
+            f"{path}: joints: not finite as float32 in scene {scene}, sample {sample}, frame {frame}, person {person}, "
+            f"who is scored in {task}; {int(bad.sum())} such places"
         )
     return torch.from_numpy(np.nan_to_num(joints))
 

@@ -101,6 +101,7 @@ Arrays = dict[str, Any]
 BROKEN: dict[str, tuple[Callable[[Arrays], Any], str]] = {
     "another frame rate": (lambda a: a.update(fps=20.0), r"fps: got 20.0, expected 30; resample"),
     "no frame rate": (lambda a: a.update(fps=np.nan), "fps: got nan, expected 30"),
+    "a frame rate as text": (lambda a: a.update(fps="30"), "fps: got '30', expected 30"),
     "Python objects": (
         lambda a: a.update(scenes=np.array(list(a["scenes"]), dtype=object)),
         r"b\.npz: scenes: got Python objects, expected text or numbers",
@@ -121,7 +122,7 @@ BROKEN: dict[str, tuple[Callable[[Arrays], Any], str]] = {
     ),
     "too large": (
         lambda a: a.update(joints=np.where(a["joints"] == a["joints"].max(), 1e300, a["joints"].astype(float))),
-        "not a number in scene",
+        "not finite as float32 in scene",
     ),
     "no joints": (lambda a: a.pop("joints"), "lacks joints; it has benchmark, fps, method, scenes, task"),
 }
