@@ -3,8 +3,8 @@
 Install it by Edit, Preferences, Add-ons, Install from Disk, and say there where the program `magnet` is. It is then in
 the sidebar of the 3D viewport (N), tab magnet. docs/blender.md shows the way.
 
-Each selected armature is written as a GLB, `magnet` runs as a process of its own while Blender goes on, and what it
-made is brought in as new objects in a collection of their own. What was there is not changed.
+Selected armatures are written as GLB, `magnet` runs as a process of its own while Blender goes on, and what it made is
+brought in as new objects in a collection of their own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +21,7 @@ import bpy
 
 bl_info = {
     "name": "magnet: people who move together",
-    "description": "Selected people go on together, get a partner, or new ones come from nothing",
     "location": "3D Viewport > Sidebar > magnet",
-    "version": (0, 1, 0),
     "blender": (4, 2, 0),
     "category": "Animation",
 }
@@ -98,10 +95,7 @@ class Preferences(bpy.types.AddonPreferences):
 
 
 def commands(program: str, files: list[str], settings: Any, context: int, fps: float, folder: Path) -> list[list[str]]:
-    """The commands, one after the other, for people who are in `files`; the last writes what is brought in.
-
-    `context` frames of a scene at rate `fps` lead to the current one.
-    """
+    """Commands that run one after the other, for people in files; `context` frames at rate `fps` lead to the last."""
     way, name, more = WAYS[settings.way], settings.way, shlex.split(settings.more)
     made = folder / ("made.npz" if settings.characters and files else "made.glb")
     if name == "refine":
@@ -167,6 +161,12 @@ def people_of(context: Any) -> list[Any]:
     return sorted(found - {None}, key=lambda thing: (thing != first, thing.name))
 
 
+def loose(person: Any) -> bool:
+    """Whether deform bones hang on controls and not on each other, as Rigify's do: no copy could bend as one."""
+    bones = [bone for bone in person.data.bones if bone.use_deform and bone.parent is not None]
+    return sum(not any(above.use_deform for above in bone.parent_recursive) for bone in bones) > 1
+
+
 def supported(operator: Any, **options: Any) -> dict[str, Any]:
     """Those options that this Blender's operator has."""
     return {name: value for name, value in options.items() if name in operator.get_rna_type().properties}
@@ -197,7 +197,7 @@ def write(context: Any, person: Any, path: Path, first: int, last: int) -> None:
             export_force_sampling=True,
             export_optimize_animation_size=False,
             export_morph_animation=False,
-            export_def_bones=False,
+            export_def_bones=True,
         )
         save(filepath=str(path), export_format="GLB", **options)
     finally:
@@ -206,15 +206,11 @@ def write(context: Any, person: Any, path: Path, first: int, last: int) -> None:
         select(context, *selected)
 
 
-def curves(action: Any) -> Iterator[Any]:
+def curves(action: Any) -> list[Any]:
     """An action's curves, in Blenders with layers and without."""
-    if not hasattr(action, "layers"):
-        yield from action.fcurves
-        return
-    for layer in action.layers:
-        for strip in layer.strips:
-            for bag in strip.channelbags:
-                yield from bag.fcurves
+    strips = [strip for layer in getattr(action, "layers", ()) for strip in layer.strips]
+    bags = [bag for strip in strips for bag in strip.channelbags] if hasattr(action, "layers") else [action]
+    return [curve for bag in bags for curve in bag.fcurves]
 
 
 def delay(action: Any, frames: float) -> None:
@@ -286,6 +282,8 @@ class MAGNET_OT_make(bpy.types.Operator):
         last = scene.frame_current if way.until_now else scene.frame_end
         if way.least and last <= self.first:
             return f"{way.label}: reads the frames {self.first} to {last}; it needs two or more"
+        if apart := [person.name for person in people if settings.characters and loose(person)]:
+            return f"{apart[0]}: its deform bones hang on controls (Rigify?); leave On these characters out"
         self.folder = Path(tempfile.mkdtemp(prefix="magnet-"))
         files = []
         for number, person in enumerate(people):
@@ -307,7 +305,7 @@ class MAGNET_OT_make(bpy.types.Operator):
             if thing.name in self.copied:
                 thing.hide_set(True)
         self.clear()
-        self.report({"INFO"}, f"{len(new)} people from frame {self.first} on; notes are in the text {TEXT}")
+        self.report({"INFO"}, f"{len(new)} people from frame {self.first} on; notes: the text {TEXT}")
         return {"FINISHED"}
 
     def clear(self) -> None:

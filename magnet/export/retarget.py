@@ -42,6 +42,8 @@ SAME_BODY = 0.002
 """Largest difference of rest joints, in metres, for a skeleton to count as the body's own."""
 RESTS = 2
 """First frames that hold a rest pose, at most, where programs put one before the motion."""
+SHOWN = 20
+"""Joints that nothing was taken from, so many of which are named."""
 POOR_FIT, REFUSED_FIT = 0.04, 0.15
 """Mean distance of joints, in metres, above which a fit is reported as poor, and above which it is refused."""
 
@@ -76,7 +78,8 @@ class Source:
             if self.poor:
                 lines.append("  that is much: its proportions are far from a person's; hands and feet may miss")
             if self.unused:
-                lines.append(f"  not mapped: {', '.join(self.unused)}")
+                more = f" and {len(self.unused) - SHOWN} more" if len(self.unused) > SHOWN else ""
+                lines.append(f"  not mapped: {', '.join(self.unused[:SHOWN])}{more}")
         if self.jumps:
             lines.append(f"  {_jumps_said(self.jumps)}")
         return "\n".join(lines)

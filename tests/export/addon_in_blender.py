@@ -79,8 +79,14 @@ def main(addon, program, duo, out):
     found["refine"] = pressed(scene.magnet, "refine", one, two, more="")
     found["nobody"] = pressed(scene.magnet, "go_on")
     found["wrong"] = pressed(scene.magnet, "go_on", one, more="--task.nonsense 3")
+    arms = bpy.data.objects[one].data  # two deform bones hang on a control now
+    for name in ("left_collar", "right_collar"):
+        arms.bones[name].use_deform = True
+        for above in arms.bones[name].parent_recursive:
+            above.use_deform = False
+    found["loose"] = pressed(scene.magnet, "go_on", one, characters=True)
     module.program_of = lambda context: "/no/such/magnet"
-    found["absent"] = pressed(scene.magnet, "go_on", one)
+    found["absent"] = pressed(scene.magnet, "go_on", two)
     module.unregister()
     with open(out, "w", encoding="utf-8") as file:
         json.dump(found, file)

@@ -162,4 +162,5 @@ def test_blender_says_what_is_wrong_and_brings_in_nothing(in_blender: dict[str, 
     assert "select 1 or more armatures; 0 are" in in_blender["nobody"]["error"]
     assert "no option --task.nonsense" in in_blender["wrong"]["error"]
     assert "say in the add-on's preferences where magnet is" in in_blender["absent"]["error"]
-    assert not any(in_blender[way]["left"] for way in ("nobody", "wrong", "absent"))
+    assert "person_0: its deform bones hang on controls" in in_blender["loose"]["error"]
+    assert not any(in_blender[way]["left"] for way in ("nobody", "wrong", "absent", "loose"))
