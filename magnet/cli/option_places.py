@@ -107,7 +107,7 @@ def flat_key(key: str) -> str:
 
 def as_key(flags: str) -> str:
     """A text in which flags are named, as `--data.batch_size`, with their keys in a file instead."""
-    return re.sub(r"--(?:(model|data)\.)?", lambda match: f"{match[1]}.init_args." if match[1] else "", flags)
+    return re.sub(r"--(?!help\b)(?:(model|data)\.)?", lambda match: f"{match[1]}.init_args." if match[1] else "", flags)
 
 
 def _entries(file: str) -> Iterator[tuple[str, int, yaml.Node]]:

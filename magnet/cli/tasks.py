@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jsonargparse import ArgumentError, ArgumentParser
+from jsonargparse import ArgumentError, ArgumentParser, Namespace
 
 from magnet.checks import require_whole
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
-from magnet.cli.flags import of_preset, taken_out
+from magnet.cli.flags import flat, of_preset, taken_out
 from magnet.plugins import Registered, summary, told
 from magnet.tasks import Task, registry
 from magnet.tasks.base import fault_of, schedule_of
@@ -44,7 +44,7 @@ class TaskChoice:
         Raises:
             ValueError: its fields contradict each other.
         """
-        return registry.get(self.name)(**self.fields)
+        return made(registry.get(self.name), self.fields)
 
     @property
     def spec(self) -> dict[str, Any]:
@@ -113,6 +113,16 @@ def task_parser(kind: type | None, **settings: Any) -> ArgumentParser:
     return parser
 
 
+def made(kind: type, fields: Mapping[str, Any]) -> Any:
+    """A task of a class from its options in plain values; a dataclass among them is made of its own, too.
+
+    Raises:
+        ValueError: its fields contradict each other.
+    """
+    parser = task_parser(kind)
+    return parser.instantiate(parser.parse_object({"task": dict(fields)})).task if fields else kind()
+
+
 def read_fields(
     parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
 ) -> dict[str, Any]:
@@ -125,9 +135,11 @@ def read_fields(
         cfg = parser.get_defaults(skip_validation=True)
         for options in below:
             for key, value in options.items():
-                if f"task.{key}" not in cfg:
-                    raise CommandError(unknown_option(parser, f"--task.{key}", more))
-                cfg[f"task.{key}"] = value
+                nested = isinstance(value, dict) and isinstance(cfg.get(f"task.{key}"), Namespace)
+                for name, part in (flat({key: value}) if nested else {key: value}).items():
+                    if f"task.{name}" not in cfg:
+                        raise CommandError(unknown_option(parser, f"--task.{name}", more))
+                    cfg[f"task.{name}"] = part
         return dict(parser.parse_args(flags, namespace=cfg).as_dict())
     except ArgumentError as error:
         message = str(error)
@@ -192,9 +204,16 @@ def options(task: type) -> str:
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        value = "(required)" if default is dataclasses.MISSING else as_flag(default)
-        flags.append(f"--task.{field.name} {value}")
+        flags += flags_of(f"--task.{field.name}", default)
     return "  ".join(flags) or "no options"
+
+
+def flags_of(flag: str, value: Any) -> list[str]:
+    """A field's value as flags: of a dataclass those of each of its own fields."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        own = dataclasses.fields(value)
+        return [each for field in own for each in flags_of(f"{flag}.{field.name}", getattr(value, field.name))]
+    return [f"{flag} {'(required)' if value is dataclasses.MISSING else as_flag(value)}"]
 
 
 def as_flag(value: Any) -> str:
@@ -262,7 +281,8 @@ def show_task(arguments: list[str]) -> int:
     name, *rest = arguments
     kind = task_class(name)
     fields = read_fields(show_parser(kind), rest, (), f"magnet tasks show {name} --help")
-    task, shown = kind(**fields.get("task", {})), Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
+    task = made(kind, fields.get("task", {}))
+    shown = Shown(**{f.name: fields[f.name] for f in dataclasses.fields(Shown)})
     require_whole("tokens", shown.tokens, most=MOST_TOKENS)
     require_whole("people", shown.people, most=MOST_PEOPLE)
     sizes = (shown.tokens, shown.people, shown.context, shown.steps, shown.window, shown.stride, shown.pyramid_offset)

@@ -66,7 +66,11 @@ def test_a_wrong_option_of_a_data_set_in_a_mixture_is_named_by_its_place(
         ("fit", "trainer:\n  max_stps: 3\n", "line 2: no option trainer.max_stps; did you mean trainer.max_steps?"),
         ("test", "sampler:\n  setle: hold\n", "line 2: no option sampler.setle; did you mean sampler.settle?"),
         ("test", "samplez: 3\n", "line 1: no option samplez; did you mean samples?"),
-        ("test", "task: {name: inbetweening,\n  evry: 3}\n", "line 2: no option task.evry; did you mean task.every?"),
+        (
+            "test",
+            "task: {name: inbetweening,\n  evry: 3}\n",
+            "line 2: no option task.evry; did you mean task.every? See magnet test --help",
+        ),
         ("test", "task:\n  name: inbetweening\n  every: x\n", "line 3: task.every: got x, expected a whole number"),
     ],
 )

@@ -16,6 +16,8 @@ import pytest
 from PIL import Image
 
 from magnet import __version__, cli
+from magnet.cli.bench import task_options
+from magnet.cli.tasks import parse_task
 from magnet.plugins import Failed, Registered
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.tasks import registry
@@ -37,6 +39,37 @@ class Foreign:
         known = grid.past()
         known[: grid.context + self.keep] = True
         return MaskSchedule.full_sequence(known, ~known, grid)
+
+
+@dataclass(frozen=True)
+class Beat:
+    """When poses are given: token steps between beats, and before the first."""
+
+    every: int = 4
+    first: int = 0
+
+
+@dataclass(frozen=True)
+class OnBeats:
+    """Fill in what lies between beats.
+
+    Args:
+        beat: when poses are given.
+    """
+
+    formula: ClassVar[str] = "P(everything | beats)"
+    beat: Beat = field(default_factory=Beat)
+
+    def schedule(self, grid: Grid) -> MaskSchedule:
+        known = grid.past()
+        known[self.beat.first :: self.beat.every] = True
+        return MaskSchedule.full_sequence(known, ~known, grid)
+
+
+@pytest.fixture
+def on_beats(monkeypatch: pytest.MonkeyPatch) -> None:
+    registry.discover()
+    monkeypatch.setitem(registry.TASKS.known, "on_beats", Registered("on_beats", OnBeats, "strange-tasks 3.1"))
 
 
 @pytest.fixture
@@ -151,6 +184,23 @@ def test_fields_change_the_plan(capsys: pytest.CaptureFixture[str], foreign: Non
     assert first != printed(capsys, "show", "agentic_async")
     assert "o 9 9 ." in printed(capsys, "show", "agentic_async", "--turn", "2")  # as `duet` takes turns
     assert "o o o o o o 9" in printed(capsys, "show", "foreign", "--task.keep", "2", "--window", "16")
+
+
+def test_a_task_gets_its_own_dataclass_from_flags_and_files(capsys: pytest.CaptureFixture[str], on_beats: None) -> None:
+    assert "--task.beat.every 4  --task.beat.first 0" in printed(capsys)
+    first = printed(capsys, "show", "on_beats")
+    assert first != printed(capsys, "show", "on_beats", "--task.beat.every", "3")
+    assert "did you mean --task.beat.every?" in complaint(capsys, "show", "on_beats", "--task.beat.evry", "3")
+    choice = parse_task("on_beats", ["--task.beat.first", "2"], [{"beat": {"every": 3}}])
+    assert choice.task == OnBeats(Beat(every=3, first=2))
+    assert choice.spec == {"name": "on_beats", "beat": {"every": 3, "first": 2}}
+    file_alone = parse_task("on_beats", [], [{"beat": {"every": 3}}])
+    assert file_alone.spec["beat"] == {"every": 3, "first": 0}  # what the file leaves out stays as it is
+
+
+def test_bench_takes_options_of_a_dataclass_in_a_task(on_beats: None) -> None:
+    asked = task_options({"beat.every": ["--task.beat.every", "3"]}, ["on_beats", "joint_future"])
+    assert asked == {"on_beats": {"beat": Beat(every=3)}, "joint_future": {}}
 
 
 def test_show_help_explains_sizes_and_fields(capsys: pytest.CaptureFixture[str], foreign: None) -> None:
