@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.metadata
 import os
 import platform
@@ -168,6 +169,12 @@ GROUPS = ("magnet.tasks", "magnet.datamodules", "magnet.metrics")
 
 def others() -> Iterator[Finding]:
     """What other packages add; nothing is imported where none adds anything."""
+    for group in sorted(plugins.entry_points().groups - {*GROUPS}):
+        for point in plugins.entry_points(group=group) if group.startswith("magnet.") else ():
+            package = point.dist.name if point.dist else point.value
+            meant = " or ".join(difflib.get_close_matches(group, GROUPS, n=1) or GROUPS)
+            advice = f"name the group {meant} in the pyproject.toml of {package}"
+            yield Finding("plug-ins", point.name, "wrong", f"of {package}: nothing reads entry points {group}", advice)
     if not os.environ.get("MAGNET_TASKS") and not any(plugins.entry_points(group=group) for group in GROUPS):
         return
     from magnet.datamodules import registry as data

@@ -16,7 +16,7 @@ from jsonargparse import ActionConfigFile, DefaultHelpFormatter, Namespace
 from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
-from magnet.cli.flags import chosen_flags, closest, refused
+from magnet.cli.flags import chosen_flags, class_in_flags, closest, refused
 from magnet.cli.named_files import unquoted
 from magnet.cli.option_places import as_key, flat_key, in_files, no_class, place_of, with_place
 from magnet.cli.unknown_classes import no_such_class
@@ -27,6 +27,9 @@ USAGE = (
     "{more}[--ckpt_path FILE] [--trainer.FIELD VALUE]"
 )
 
+
+OPTIMIZING = ("optimizer", "lr_scheduler")
+"""Options of a training that name a class, beside those of every command."""
 
 SHARING = ("model", "data")
 """Their classes have many fields in common, which help tells once. Of a task all fields are told."""
@@ -71,6 +74,13 @@ class Parser(LightningArgumentParser):
         self.layers: list[str] = []
         self.files: list[str] = []
         self.topic = ""
+        self.kind: type | None = None  # of a parser inside: the class whose fields it knows
+
+    def add_class_arguments(self, theclass: Any, nested_key: str | None = None, *args: Any, **kwargs: Any) -> list[str]:
+        """As the parser does; remembers the class for what it says of it."""
+        if nested_key is None and isinstance(theclass, type):
+            self.kind = theclass
+        return super().add_class_arguments(theclass, nested_key, *args, **kwargs)
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Namespace | None = None, **kwargs: Any
@@ -161,9 +171,19 @@ class Parser(LightningArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Say what is wrong, and the closest thing that would be right."""
         told = self if self.command or Parser.root is None else Parser.root
+        lacking = re.search(r"arguments are required: (.+)", message)
+        if self is not told and self.kind is not None and lacking:
+            message = told.lacks(self.kind.__name__, lacking[1].split(", "))
         said = told.clearer(message)
         print(refused(told.command, said + unquoted(told.arguments)), file=sys.stderr)
         sys.exit(2)
+
+    def lacks(self, kind: str, names: Sequence[str]) -> str:
+        """That a class is not given what it has no default for: as flags, where it is the one that a flag names."""
+        named = dict(self.chosen) | {key: class_in_flags(self.arguments, key) or "" for key in OPTIMIZING}
+        key = next((key for key, path in named.items() if path.rpartition(".")[2] == kind), None)
+        needed = " and ".join(f"--{key}.{name}" if key else name for name in names)
+        return f"{kind} needs {needed}, which is not given{'' if key else '; it belongs under its init_args'}"
 
     def clearer(self, message: str) -> str:
         """The parser's message without its internals."""

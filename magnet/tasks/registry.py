@@ -18,6 +18,9 @@ T = TypeVar("T", bound=type)
 
 
 def _check(name: str, task: type) -> None:
+    if "." in name:
+        better = snake_case(name.replace(".", "_"))
+        raise ValueError(f"task {name}: what stands before a point would be a module; call it {better}")
     missing = [part for part in ("schedule", "formula") if not hasattr(task, part)]
     if not is_dataclass(task) or missing:
         what = f"has no {' and no '.join(missing)}" if missing else "is not a dataclass"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
 import pytest
@@ -102,10 +102,11 @@ def test_what_packages_add_is_listed_and_what_failed_has_its_reason(
         EntryPoint("theirs_bad", "theirs_for_doctor:Bad", "magnet.tasks"),
         EntryPoint("TheirShoes", "theirs_for_doctor:Shoes", "magnet.datamodules"),
         EntryPoint("their_number", "shoes_of_mine:Number", "magnet.metrics"),
+        EntryPoint("their_slip", "theirs_for_doctor:Good", "magnet.task"),
     ]
     for registry in (TASKS, DATA, METRICS):
         registry.discover()  # ours register once, and the tests after this one need them too
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [each for each in points if each.group == group])
+    monkeypatch.setattr(plugins, "entry_points", lambda **group: EntryPoints(points).select(**group))
     for registry in (TASKS, DATA, METRICS):
         monkeypatch.setattr(registry, "known", dict(registry.known))
         monkeypatch.setattr(registry, "failed", [])
@@ -116,4 +117,6 @@ def test_what_packages_add_is_listed_and_what_failed_has_its_reason(
     assert re.search(r"WRONG +task theirs_bad +of theirs_for_doctor:Bad: task theirs_bad: schedule\(grid\) fails", said)
     assert re.search(r"WRONG +data set TheirShoes +of .*: failed to load: AttributeError: .*'Shoes'", said)
     assert re.search(r"WRONG +metric their_number +of .*: failed to load: ModuleNotFoundError: .*shoes_of_mine", said)
+    assert re.search(r"WRONG +their_slip +of .*: nothing reads entry points magnet.task$", said, re.MULTILINE)
+    assert re.search(r"their_slip +name the group magnet.tasks in the pyproject.toml", said)
     assert "mend or uninstall shoes_of_mine:Number; everything else works without it" in said

@@ -48,6 +48,39 @@ def test_classes_of_the_working_directory_are_found_where_flags_name_them(
     assert "mine is imported" in capsys.readouterr().out
 
 
+NEEDY = """
+from lightning.pytorch import Callback
+from magnet.datamodules import MotionDataModule
+
+class Needy(MotionDataModule):
+    def __init__(self, folder: str, **kwargs):
+        super().__init__(**kwargs)
+
+class Rings(Callback):
+    def __init__(self, every: int):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--data", "classes_of_mine.Needy"], "Needy needs --data.folder, which is not given"),
+        (["--lr_scheduler", "StepLR"], "StepLR needs --lr_scheduler.step_size, which is not given"),
+        (
+            ["--trainer.callbacks", "classes_of_mine.Rings"],
+            "Rings needs every, which is not given; it belongs under its",
+        ),
+    ],
+)
+def test_an_option_that_a_class_needs_is_named_as_users_write_it(
+    words: list[str], said: str, module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(f"{module}.py").write_text(NEEDY)
+    assert cli.main(["fit", "--model", "ToyModel", "--data", "ToyData", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_nothing_of_the_working_directory_is_imported_unless_a_class_is_asked_for(
     module: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,6 +54,13 @@ def test_an_installed_package_adds_its_task(clean_registry, monkeypatch):
     assert registry.get("duel") is Foreign
 
 
+def test_a_name_that_options_would_read_as_a_path_is_refused(clean_registry, monkeypatch):
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [FakePoint("Their.duel", lambda: Foreign)])
+    registry.discover(again=True)
+    with pytest.raises(ValueError, match="would be a module; call it their_duel"):
+        registry.get("Their.duel")
+
+
 def test_a_plug_in_that_fails_is_listed_and_hides_no_other(clean_registry, monkeypatch):
     def broken():
         raise ImportError("No module named nope")
