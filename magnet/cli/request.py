@@ -96,7 +96,8 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     for note in settled.notes:
         print(f"magnet: {note}", file=sys.stderr)
     task = sampled_task(command, given, fields, settled) if command in SAMPLING else None
-    layers = [each.text() for each in settled.layers if each.options]
+    shown = {"ckpt_path": given.flag("ckpt_path")} if given.only_shown and given.flag("ckpt_path") else {}
+    layers = [each.text() for each in [*settled.layers, Layer("", shown)] if each.options]  # of it the rest is told
     asked = (flag for flag, _ in valued(given.flags) if flag.removeprefix("--").partition(".")[0] in SAMPLED)
     sampled = next(asked, None)
     return Request(command, words, layers, read, checkpoint, folder, not out, settled.classes, task, sampled)

@@ -245,6 +245,14 @@ def test_print_config_is_a_configuration(toy: Path, capsys: pytest.CaptureFixtur
     assert yaml.safe_load(first)["model"]["init_args"]["lr"] == 0.3
 
 
+@pytest.mark.parametrize("command", ["fit", "test", "predict"])
+def test_a_printed_configuration_names_the_checkpoint_that_flags_named(
+    command: str, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([command, "--ckpt_path", "trained", "--print_config"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["ckpt_path"] == "trained"
+
+
 def test_latest_leads_to_the_newest_run(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (toy / "salsa.yaml").write_text("model: {class_path: ToyModel}\ntrainer: {max_epochs: 1}\n")
     for _ in range(2):
