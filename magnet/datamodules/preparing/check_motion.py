@@ -175,6 +175,11 @@ def check_apart(transl: Array, valid: Bools) -> None:
         DataError: they put everybody into one place.
     """
     apart = _apart(transl, valid)
+    if apart == 0:
+        raise DataError(
+            "translations of different people are the same: their files are one and the same recording, or hold no "
+            "translations; give each person's own"
+        )
     if apart is not None and apart < INSIDE:
         raise DataError(
             f"translations of different people are {1000 * apart:.1f} mm apart: they look too small, perhaps they were "

@@ -19,6 +19,7 @@ from magnet.datamodules.fakes.motion import FakeMotion, made_up_body, people
 from magnet.datamodules.preparing import check_people
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions, canonicalize
 from magnet.datamodules.preparing.check import check_download, check_store
+from magnet.datamodules.preparing.check_motion import check_apart
 from magnet.datamodules.preparing.check_people import Flag, described, frozen, held, jumps
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert
 from magnet.datamodules.preparing.prepare import prepare
@@ -339,3 +340,13 @@ def test_one_glitch_is_found_in_cmus_recordings_and_no_false_one(cmu_root: Path)
         "person 0 (subject 05): right_hip turns by 161 degrees from frame 98 to 99 at 30 fps (3.30 s)"
     )
     assert only.endswith("(05_15)")
+
+
+@pytest.mark.parametrize(
+    ("metres", "said"), [(0.0, "one and the same recording"), (5e-4, "0.5 mm apart: they look too")]
+)
+def test_one_recording_given_for_two_people_is_told_as_that_and_not_as_a_unit(metres: float, said: str) -> None:
+    walk = np.linspace(0, 2, 60)[:, None, None] * np.ones((60, 2, 3))
+    walk[:, 1, 0] += metres
+    with pytest.raises(DataError, match=said):
+        check_apart(walk, np.ones((60, 2), dtype=bool))
