@@ -139,7 +139,7 @@ def _refusal(refused: list[str], most: int = 5) -> str:
     listed = "".join(f"\n  {line}" for line in refused[:most])
     more = f"\n  and {len(refused) - most} more" if len(refused) > most else ""
     return (
-        f"refused, as not what this project was tested with: {counted(len(refused), 'file')}:{listed}{more}\n"
+        f"{counted(len(refused), 'file')} not as this project was tested with, refused:{listed}{more}\n"
         "changed on the way, or the site has issued them anew: try again, or take them as they are with "
         "--any_version"
     )
