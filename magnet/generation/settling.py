@@ -76,6 +76,9 @@ REACH = 6
 LEFT, TOO_DEEP = Apart(body=0.07, arms=0.07), Apart(body=0.08, arms=0.08)
 """Metres of depth that `SHOWN` may leave, and `FINISHED`."""
 
+THROWN, BEARABLE = 31.0, Apart(body=0.10, arms=0.10)
+"""Acceleration of a pelvis, m/s², that no dancer's has: rather than so, somebody is left in another up to this deep."""
+
 PACE = 3
 """Frames over which it is measured how fast somebody goes who is not seen any further."""
 
@@ -234,10 +237,13 @@ def own_correction(
     past: Tensor | None,
     holding: Tensor | None,
     last: tuple[Tensor, Tensor] | None,
+    led: Tensor | None,
+    block: int,
 ) -> Tensor:
     """How one person's next frames are corrected (`SHOWN`), and anew where that leaves people deep in each other.
 
-    Arguments as for `magnet.body.repair.settling`. -> (B, T, P, DOFS)
+    Arguments as for `magnet.body.repair.settling` and `settled_on`, and `led` (B, LEAD, P, 3), pelvises in the frames
+    before; None: there are none. -> (B, T, P, DOFS)
     """
     offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last)
     for harder in PRESSED:
@@ -247,8 +253,23 @@ def own_correction(
         before, hold = (None if each is None else each[deep] for each in (past, holding))
         ends = None if last is None else (last[0][deep], last[1][deep])
         few = seen.select(deep.nonzero()[:, 0])
-        offset[deep] = settling(few, body, how, fixed, harder, begun, before, holding=hold, last=ends)
+        made = settling(few, body, how, fixed, harder, begun, before, holding=hold, last=ends)
+        if harder is PRESSED[-1] and led is not None:
+            bears = ~left_deep(corrected(few, offset[deep]), body, BEARABLE, fixed).any(dim=1)
+            made = torch.where((bears & thrown(few, made, led[deep], block))[:, None, None, None], offset[deep], made)
+        offset[deep] = made
     return offset
+
+
+def thrown(scene: Scene, offset: Tensor, led: Tensor, block: int) -> Tensor:
+    """Whether a correction (B, T, P, DOFS) throws somebody in the first `block` frames. -> (B,) bool
+
+    led (B, LEAD, P, 3) where pelvises were in the frames before
+    """
+    ahead = (scene.T_world_root[..., :3, 3] + offset[..., :3])[:, : block + 1]
+    pushed = (offset != 0).any(dim=-1).any(dim=1)  # (B, P)
+    rates = torch.cat([led, ahead], dim=1).diff(n=2, dim=1).norm(dim=-1).amax(dim=1) * scene.fps**2
+    return ((rates > THROWN) & pushed).any(dim=1)
 
 
 def left_deep(scene: Scene, body: Body, allowed: Apart, fixed: Tensor) -> Tensor:
@@ -304,8 +325,9 @@ def settled_on(
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
     earlier = None if past is None else past.offset[:, :, there]
     whole, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    parted = last = None
+    parted = last = led = None
     if known is not None:
+        led = known.T_world_root[:, -LEAD:, :, :3, 3] if known.frames >= LEAD else None
         joints = body.joints(known)
         plain = joints
         if uncorrected is not None:
@@ -329,7 +351,7 @@ def settled_on(
             if told is not None:
                 seen = as_expected(seen, told[0].permute_agents(there), torch.isin(there, told[1]))
         own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
-        changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last)
+        changes = own_correction(seen, body, how, ~(new & one), known is not None, own, holding, last, led, block)
         whole[:, :, who[number]] = changes[:, :, number]
         if bool((sees[:, number] & moving).any()):  # else nobody asks how it was corrected
             done = corrected(shaped, changes * one[:, None])
