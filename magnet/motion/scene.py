@@ -200,7 +200,8 @@ class Scene:
         """
         extra = agents - self.agents
         if extra < 0:
-            raise ValueError(f"the scene has {self.agents} agents, but room was asked for {agents}")
+            more = "a model's max_agents must be at least those of its data"
+            raise ValueError(f"the scene has {self.agents} agents, but room was asked for {agents}: {more}")
         if extra == 0:
             return self
         empty = empty_scene(self.scenes, self.frames, extra, self.T_world_root)

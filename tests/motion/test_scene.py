@@ -38,7 +38,7 @@ def test_padding_adds_nobody(scene: Scene):
     padded = scene.pad_agents(5)
     assert padded.present.sum() == scene.present.sum()
     assert torch.equal(padded.T_world_root[:, :, :3], scene.T_world_root)
-    with pytest.raises(ValueError, match="room was asked for 2"):
+    with pytest.raises(ValueError, match="room was asked for 2: a model's max_agents"):
         scene.pad_agents(2)
 
 
