@@ -1,10 +1,7 @@
 """An add-on for Blender (4.2 and later): selected people go on together, get a partner, or new ones come from nothing.
 
-Install it by Edit, Preferences, Add-ons, Install from Disk, and say there where the program `magnet` is. It is then in
-the sidebar of the 3D viewport (N), tab magnet. docs/blender.md shows the way.
-
 Selected armatures are written as GLB, `magnet` runs as a process of its own while Blender goes on, and what it made is
-brought in as new objects in a collection of their own.
+brought in as new objects in a collection of their own. docs/blender.md shows how to install and use it.
 """
 
 from __future__ import annotations
@@ -26,11 +23,8 @@ bl_info = {
     "category": "Animation",
 }
 
-RATE = 30.0
-"""Frames a second of what magnet makes."""
-
-TEXT = "magnet"
-"""The text in Blender's text editor that holds what the program said."""
+RATE = 30.0  # frames a second of what magnet makes
+TEXT = "magnet"  # the text in Blender's text editor that holds what the program said
 
 
 class Way(NamedTuple):
@@ -47,20 +41,10 @@ class Way(NamedTuple):
 WAYS = {
     "go_on": Way("Go on", "Selected people go on after the current frame", "--task joint_future", 1, True, True),
     "answer": Way(
-        "Answer",
-        "From the current frame on the active person answers what the other selected people do, as if live",
-        "--task motion_control --task.target [0]",
-        2,
+        "Answer", "The active person answers the others from now on", "--task motion_control --task.target [0]", 2
     ),
-    "partner": Way(
-        "Add a partner",
-        "Somebody new beside who is selected, from the scene's first frame to its last",
-        "--task partner_inpainting",
-        1,
-    ),
-    "again": Way(
-        "Make anew", "The active person anew, to fit the other selected people", "--task partner_inpainting", 2
-    ),
+    "partner": Way("Add a partner", "Somebody new, from the first frame to the last", "--task partner_inpainting", 1),
+    "again": Way("Make anew", "The active person anew, to fit the others", "--task partner_inpainting", 2),
     "new": Way("From nothing", "New people, whoever is selected", "", 0, True, True),
     "refine": Way("Refine", "Who is selected, out of each other's bodies, with feet that stand", "--apart firm", 1),
 }
@@ -69,22 +53,16 @@ WAYS = {
 class Settings(bpy.types.PropertyGroup):
     way: bpy.props.EnumProperty(name="", items=[(name, way.label, way.description) for name, way in WAYS.items()])
     frames: bpy.props.IntProperty(name="Frames", description="Frames of this scene to make", default=120, min=1)
-    people: bpy.props.IntProperty(
-        name="People", description="People who come from nothing", default=2, min=1, max=200, soft_max=4
-    )
+    people: bpy.props.IntProperty(name="People", description="New people", default=2, min=1, max=200, soft_max=4)
     seed: bpy.props.IntProperty(name="Seed", description="Another seed, another result", default=1, min=0)
-    characters: bpy.props.BoolProperty(
-        name="On these characters", description="On copies of what is selected, not on magnet's body", default=True
-    )
+    characters: bpy.props.BoolProperty(name="On these characters", description="On copies of them", default=True)
     hide: bpy.props.BoolProperty(name="Hide what was selected", description="Copies stand in it", default=True)
     more: bpy.props.StringProperty(name="Options", description="Of the command, such as --sampler.settle firm")
 
 
 class Preferences(bpy.types.AddonPreferences):
     bl_idname = __name__
-    program: bpy.props.StringProperty(
-        name="magnet", description="The program, such as CLONE/.venv/bin/magnet", subtype="FILE_PATH"
-    )
+    program: bpy.props.StringProperty(name="magnet", description="As CLONE/.venv/bin/magnet", subtype="FILE_PATH")
 
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "program")
@@ -96,7 +74,8 @@ class Preferences(bpy.types.AddonPreferences):
 
 def commands(program: str, files: list[str], settings: Any, context: int, fps: float, folder: Path) -> list[list[str]]:
     """Commands that run one after the other, for people in files; `context` frames at rate `fps` lead to the last."""
-    way, name, more = WAYS[settings.way], settings.way, shlex.split(settings.more)
+    way, name = WAYS[settings.way], settings.way
+    more = shlex.split(settings.more.replace("\\", "\\\\"))  # a \ stays one, for paths on Windows
     made = folder / ("made.npz" if settings.characters and files else "made.glb")
     if name == "refine":
         first = [program, "refine", *files, str(made), *way.words.split(), *more]
@@ -153,12 +132,23 @@ class Run:
 # -- to and from Blender ------------------------------------------------------------------------
 
 
+def armature_of(thing: Any) -> Any:
+    return thing if thing is None or thing.type == "ARMATURE" else thing.find_armature()
+
+
 def people_of(context: Any) -> list[Any]:
     """Armatures that are selected, or whose mesh is; that of the active object first, the others by name."""
-    found = {thing if thing.type == "ARMATURE" else thing.find_armature() for thing in context.selected_objects}
-    active = context.active_object
-    first = active if active is None or active.type == "ARMATURE" else active.find_armature()
-    return sorted(found - {None}, key=lambda thing: (thing != first, thing.name))
+    found = {armature_of(thing) for thing in context.selected_objects} - {None}
+    first = armature_of(context.active_object)
+    return sorted(found, key=lambda thing: (thing != first, thing.name))
+
+
+def meshes_of(context: Any, person: Any) -> list[Any]:
+    """Meshes that hang on an armature or that it bends: those that are seen or, where none is, all."""
+    below = set(person.children_recursive)
+    meshes = [each for each in context.scene.objects if each.type == "MESH"]
+    own = [each for each in meshes if each in below or each.find_armature() == person]
+    return [each for each in own if each.visible_get()] or own
 
 
 def loose(person: Any) -> bool:
@@ -172,38 +162,32 @@ def supported(operator: Any, **options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if name in operator.get_rna_type().properties}
 
 
-def select(context: Any, things: list[Any], active: Any) -> None:
-    """Select these, and nothing else."""
-    for thing in list(context.view_layer.objects):
-        thing.select_set(thing in things)
-    context.view_layer.objects.active = active
-
-
 def write(context: Any, person: Any, path: Path, first: int, last: int) -> None:
     """A GLB of one armature and its meshes in these frames, as it is seen: constraints and controls included."""
-    scene = context.scene
+    scene, things = context.scene, [person, *meshes_of(context, person)]
     before = scene.frame_start, scene.frame_end, scene.frame_current
-    selected = list(context.selected_objects), context.view_layer.objects.active
+    between, all_of_it = scene.frame_subframe, bpy.data.collections.new("magnet")
+    scene.collection.children.link(all_of_it)  # of a collection what is hidden is written, too; of a selection not
     try:
+        for thing in things:
+            all_of_it.objects.link(thing)
         scene.frame_start, scene.frame_end = first, last
-        select(context, [person, *(each for each in person.children_recursive if each.type == "MESH")], person)
         save = bpy.ops.export_scene.gltf
         options = supported(
             save,
-            use_selection=True,
             export_animation_mode="SCENE",
             export_anim_scene_split_object=False,
             export_anim_slide_to_zero=True,
             export_force_sampling=True,
             export_optimize_animation_size=False,
             export_morph_animation=False,
-            export_def_bones=True,
+            export_def_bones=any(bone.use_deform for bone in person.data.bones),
         )
-        save(filepath=str(path), export_format="GLB", **options)
+        save(filepath=str(path), export_format="GLB", collection=all_of_it.name, **options)
     finally:
+        bpy.data.collections.remove(all_of_it)
         scene.frame_start, scene.frame_end = before[:2]
-        scene.frame_set(before[2])
-        select(context, *selected)
+        scene.frame_set(before[2], subframe=between)
 
 
 def curves(action: Any) -> list[Any]:
@@ -217,23 +201,24 @@ def delay(action: Any, frames: float) -> None:
     """Move an action's keyframes."""
     for curve in curves(action):
         for point in curve.keyframe_points:
-            point.co.x += frames
-            point.handle_left.x += frames
-            point.handle_right.x += frames
+            point.co_ui.x += frames  # with its handles
 
 
-def bring_in(context: Any, files: list[Path], names: list[str], first: int) -> list[Any]:
+def bring_in(context: Any, files: list[Path], names: list[str], first: int, metres: bool) -> list[Any]:
     """New armatures of GLB files, whose motion begins at frame `first`, in a collection of their own.
 
     names: of the armatures, in the order of the people; others keep theirs.
+    metres: the files hold metres, and not what Blender wrote.
     """
     collection = bpy.data.collections.new("magnet")
     context.scene.collection.children.link(collection)
     new, actions = [], set(bpy.data.actions)
-    load = bpy.ops.import_scene.gltf
+    load, unit = bpy.ops.import_scene.gltf, context.scene.unit_settings
     for path in files:
-        before = set(bpy.data.objects)
+        before, scale = set(bpy.data.objects), unit.scale_length
+        unit.scale_length = scale if metres else 1.0  # the importer goes by it, the exporter does not
         load(filepath=str(path), **supported(load, bone_heuristic="BLENDER", disable_bone_shape=True))
+        unit.scale_length = scale
         brought = [thing for thing in bpy.data.objects if thing not in before]
         for thing in brought:
             for home in list(thing.users_collection):
@@ -278,42 +263,57 @@ class MAGNET_OT_make(bpy.types.Operator):
         people = people_of(context) if way.least else []
         if len(people) < way.least:
             return f"{way.label}: select {way.least} or more armatures; {len(people)} are selected"
+        if way.least > 1 and people[0] != armature_of(context.active_object):
+            return f"{way.label}: the active object is none of who is selected; click somebody last with Shift"
         self.first = scene.frame_start if way.least else scene.frame_current
         last = scene.frame_current if way.until_now else scene.frame_end
         if way.least and last <= self.first:
             return f"{way.label}: reads the frames {self.first} to {last}; it needs two or more"
+        fps, now = scene.render.fps / scene.render.fps_base, scene.frame_current
+        if settings.way == "answer" and not self.first + fps / 10 <= now <= last - fps / 7:
+            return f"{way.label}: begins in the current frame, {now}, which must lie well within {self.first} to {last}"
         if apart := [person.name for person in people if settings.characters and loose(person)]:
             return f"{apart[0]}: its deform bones hang on controls (Rigify?); leave On these characters out"
-        self.folder = Path(tempfile.mkdtemp(prefix="magnet-"))
-        files = []
-        for number, person in enumerate(people):
-            files.append(str(self.folder / f"person{number}.glb"))
-            write(context, person, Path(files[-1]), self.first, last)
+        if context.mode != "OBJECT":  # meshes in edit mode cannot be written
+            bpy.ops.object.mode_set(mode="OBJECT")
         # Their names: while the program runs objects may go, or be others after an undo.
-        self.names = [person.name for person in people]
-        self.copied = [each.name for person in people for each in (person, *person.children_recursive)]
-        fps = scene.render.fps / scene.render.fps_base
-        asked = (settings, scene.frame_current - self.first + 1, fps, self.folder)
-        self.run = Run(commands(program_of(context), files, *asked), self.folder)
+        self.names, self.metres = [person.name for person in people], not (settings.characters and people)
+        self.copied = [each.name for who in people for each in (who, *who.children_recursive, *meshes_of(context, who))]
+        self.folder = Path(tempfile.mkdtemp(prefix="magnet-"))
+        files = [str(self.folder / f"person{number}.glb") for number in range(len(people))]
+        try:
+            asked = commands(program_of(context), files, settings, now - self.first + 1, fps, self.folder)
+            for person, file in zip(people, files, strict=True):
+                write(context, person, Path(file), self.first, last)
+        except (RuntimeError, ValueError) as error:  # Blender's exporter; a quotation in Options that does not end
+            shutil.rmtree(self.folder, ignore_errors=True)
+            return f"{way.label}: {error}"
+        self.run = Run(asked, self.folder)
         return ""
 
     def end(self, context: Any) -> set[str]:
         """Bring in what was made."""
-        new = bring_in(context, sorted(self.folder.glob("made*.glb")), self.names, self.first)
-        select(context, new, new[0] if new else None)
-        for thing in list(context.view_layer.objects) if context.scene.magnet.hide else ():
-            if thing.name in self.copied:
-                thing.hide_set(True)
-        self.clear()
+        try:
+            if context.mode != "OBJECT":
+                bpy.ops.object.mode_set(mode="OBJECT")
+            old = [thing for thing in context.view_layer.objects if thing.name in self.copied]
+            new = bring_in(context, sorted(self.folder.glob("made*.glb")), self.names, self.first, self.metres)
+        finally:
+            self.clear()
+        for thing in list(context.view_layer.objects):
+            thing.select_set(thing in new)
+        context.view_layer.objects.active = new[0] if new else None
+        for thing in old if context.scene.magnet.hide else ():
+            thing.hide_set(True)
         self.report({"INFO"}, f"{len(new)} people from frame {self.first} on; notes: the text {TEXT}")
         return {"FINISHED"}
 
     def clear(self) -> None:
         """Stop the program if it runs, and keep what it said."""
         self.run.stop()
-        text = bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)
-        text.from_string("\n".join(self.run.said()))
+        said = "\n".join(self.run.said())
         shutil.rmtree(self.folder, ignore_errors=True)
+        (bpy.data.texts.get(TEXT) or bpy.data.texts.new(TEXT)).from_string(said)
 
     def failed(self, why: str, level: str = "ERROR") -> set[str]:
         self.report({level}, why)
@@ -340,23 +340,25 @@ class MAGNET_OT_make(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: Any, event: Any) -> set[str]:
-        if event.type == "ESC":
-            self.leave(context)
-            self.clear()
-            return self.failed("magnet was stopped", "WARNING")
-        if event.type != "TIMER":
+        if event.type not in ("TIMER", "ESC"):
             return {"PASS_THROUGH"}
         try:
+            if event.type == "ESC":
+                raise RuntimeError("magnet was stopped")
             done = self.run.done()
         except RuntimeError as error:
             self.leave(context)
             self.clear()
-            return self.failed(str(error))
+            return self.failed(str(error), "WARNING" if event.type == "ESC" else "ERROR")
         context.workspace.status_text_set(f"magnet (Esc stops it): {(self.run.said() or [''])[-1]}")
         if not done:
             return {"PASS_THROUGH"}
         self.leave(context)
         return self.end(context)
+
+    def cancel(self, context: Any) -> None:
+        """Blender ends, or opens another file: the program ends, too."""
+        self.clear()
 
     def leave(self, context: Any) -> None:
         context.window_manager.event_timer_remove(self.timer)

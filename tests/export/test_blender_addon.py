@@ -73,6 +73,20 @@ def test_every_way_is_in_the_table(addon: ModuleType) -> None:
     assert set(addon.WAYS) == {"go_on", "answer", "partner", "again", "new", "refine"}
 
 
+@pytest.mark.parametrize(
+    "more, words",
+    [
+        ("--ckpt_path 'my model'", ["--ckpt_path", "my model"]),
+        (r"--ckpt_path C:\mine\new", ["--ckpt_path", r"C:\mine\new"]),
+    ],
+)
+def test_options_are_texts_in_quotes_and_paths_of_windows(
+    addon: ModuleType, tmp_path: Path, more: str, words: list[str]
+) -> None:
+    [first] = addon.commands("magnet", [], asked(way="new", more=more), 16, 24.0, tmp_path)
+    assert first[-2:] == words
+
+
 def operator(addon: ModuleType, tmp_path: Path, *words: str) -> tuple[Any, Any]:
     """The button pressed, with another program in magnet's place. -> the operator, Blender's context"""
     button = addon.MAGNET_OT_make()
@@ -101,6 +115,23 @@ def test_escape_ends_the_program_and_leaves_nothing(addon: ModuleType, tmp_path:
     assert button.modal(context, SimpleNamespace(type="ESC")) == {"CANCELLED"}
     assert button.run.process.poll() is not None and not button.folder.exists()
     context.window_manager.event_timer_remove.assert_called_once()
+
+
+def test_who_ends_blender_ends_the_program(addon: ModuleType, tmp_path: Path) -> None:
+    button, context = operator(addon, tmp_path, STILL)
+    button.invoke(context, None)
+    button.modal(context, SimpleNamespace(type="TIMER"))
+    assert button.run.process.poll() is None
+    button.cancel(context)
+    assert button.run.process.poll() is not None and not button.folder.exists()
+
+
+def test_what_cannot_be_brought_in_leaves_nothing(addon: ModuleType, tmp_path: Path) -> None:
+    button, context = operator(addon, tmp_path, "")
+    addon.bring_in.side_effect = RuntimeError("no such file")
+    with pytest.raises(RuntimeError, match="no such file"):
+        button.execute(context)
+    assert not button.folder.exists()
 
 
 @pytest.mark.parametrize(
@@ -158,9 +189,22 @@ def test_blender_gets_new_people_where_the_old_ones_were(in_blender: dict[str, A
 
 
 @pytest.mark.slow
+def test_blender_gets_who_is_hidden_apart_or_of_another_unit(in_blender: dict[str, Any]) -> None:
+    for way in ("edited", "mesh_hidden", "armature_hidden", "apart", "excluded"):
+        assert in_blender[way]["meshes"] == [1], (way, in_blender[way])
+    for way in ("centimetres", "metres"):
+        assert np.max(list(in_blender[way]["away"].values())) < 0.1, (way, in_blender[way])  # of scene units: 1 mm
+
+
+@pytest.mark.slow
 def test_blender_says_what_is_wrong_and_brings_in_nothing(in_blender: dict[str, Any]) -> None:
     assert "select 1 or more armatures; 0 are" in in_blender["nobody"]["error"]
     assert "no option --task.nonsense" in in_blender["wrong"]["error"]
     assert "say in the add-on's preferences where magnet is" in in_blender["absent"]["error"]
     assert "person_0: its deform bones hang on controls" in in_blender["loose"]["error"]
-    assert not any(in_blender[way]["left"] for way in ("nobody", "wrong", "absent", "loose"))
+    assert "4, which must lie well within 5 to 40" in in_blender["before"]["error"]
+    assert "40, which must lie well within 5 to 40" in in_blender["late"]["error"]
+    assert "the active object is none of who is selected" in in_blender["not_active"]["error"]
+    assert "No closing quotation" in in_blender["quotes"]["error"]
+    wrong = ("nobody", "wrong", "absent", "loose", "before", "late", "not_active", "quotes")
+    assert not any(in_blender[way]["left"] for way in wrong)
