@@ -159,7 +159,7 @@ def why_untrained(manifest: Mapping[str, Any]) -> str | None:
     counts = {
         ("take", "skipped, as is listed above"): len(manifest["skipped"]),
         ("take", "in no split"): len(manifest["left out"]),
-        ("name", "of the lists, not in the download"): len(manifest["listed but not there"]),
+        ("name", "of the lists not in the download"): len(manifest["listed but not there"]),
     }
     facts = [f"{counted(count, what)} {where}" for (what, where), count in counts.items() if count]
     return f"no take that can be used is in train by {manifest['splits by']}" + "".join(f"; {fact}" for fact in facts)

@@ -166,7 +166,7 @@ def test_what_lists_name_and_a_download_lacks_is_said(copy, capsys):
     assert cli.main(["data", "info", "other"]) == 0
     assert cli.main(["data", "check", "other", "--picture", "none"]) == 0
     said = capsys.readouterr().out
-    wanted = "not in the download, of the lists: 7 names: gone0, gone1, gone2, gone3, gone4 and 2 more"
+    wanted = "7 names of the lists not in the download: gone0, gone1, gone2, gone3, gone4 and 2 more"
     assert said.count(wanted) == 4 and "1 take is in other; 0 were skipped." in said
 
 

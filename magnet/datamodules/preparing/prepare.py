@@ -175,7 +175,7 @@ def summary_of(reader: Reader) -> list[str]:
 
 def absent_note(names: list[str]) -> str:
     """Says which names of the lists the download lacks; perhaps it was not unpacked completely."""
-    return f"not in the download, of the lists: {counted(len(names), 'name')}: {first_names(names, 5)}"
+    return f"{counted(len(names), 'name')} of the lists not in the download: {first_names(names, 5)}"
 
 
 def read_splits(path: str | Path) -> dict[str, Split]:

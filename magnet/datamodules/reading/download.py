@@ -139,7 +139,7 @@ def _refusal(refused: list[str], most: int = 5) -> str:
     listed = "".join(f"\n  {line}" for line in refused[:most])
     more = f"\n  and {len(refused) - most} more" if len(refused) > most else ""
     return (
-        f"{counted(len(refused), 'file')} not as this project was tested with, refused:{listed}{more}\n"
+        f"refused: {counted(len(refused), 'file')} that this project was not tested with:{listed}{more}\n"
         "changed on the way, or the site has issued them anew: try again, or take them as they are with "
         "--any_version"
     )

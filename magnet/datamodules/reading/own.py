@@ -198,7 +198,7 @@ class OwnReader(Reader, Generic[T]):
         if set(sizes) == {1} and self.table is None and self.pattern is None and self.one_person_a_file:
             said.append(f"everybody is alone: no names tell who was recorded together; if some were, {HOW}")
         if left:
-            said.append(f"of no scene: {counted(len(left), 'file')}: {_listed([path.name for path in left])}")
+            said.append(f"{counted(len(left), 'file')} of no scene: {_listed([path.name for path in left])}")
         if self.in_time:
             how = "fewer than four scenes: " if self.split is None else ""
             said.append(

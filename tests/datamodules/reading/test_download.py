@@ -299,7 +299,8 @@ def test_a_file_that_is_known_to_be_another_is_refused_after_the_others_unless_t
         assert [path.name for path in (tmp_path / "singles").iterdir()] == ["02_01.amc"]
     assert fetch(site, tmp_path, any_version=True).unlike == ("singles/02.asf",)
     check(site, tmp_path)
-    with pytest.raises(DownloadError, match="1 file not as this project was tested with"):  # it lies there, and is left
+    # It lies there, and is left.
+    with pytest.raises(DownloadError, match="refused: 1 file that this project was not tested with"):
         fetch(site, tmp_path)
     check(site, tmp_path)
 
