@@ -72,10 +72,10 @@ def class_in_flags(flags: Sequence[str], key: str) -> str | None:
     return None if value in ("", "null") else value
 
 
-def refused(command: str, said: str) -> str:
-    """A mistake in a command line, as it is printed."""
+def refused(command: str, said: str, topic: str = "") -> str:
+    """A mistake in a command line, as it is printed; topic: the part of the command's help that tells more."""
     stop = "" if said.endswith("?") else "."
-    return f"magnet {command}: error: {said}{stop} See magnet {command} --help"
+    return f"magnet {command}: error: {said}{stop} See magnet {command} --help {topic}".rstrip()
 
 
 def plainly(message: str) -> str:
@@ -119,6 +119,7 @@ class PlainParser(argparse.ArgumentParser):
         )
         self.command = command
         self.elsewhere: dict[str, str] = {}  # options of other commands, and what is to be done instead
+        self.topic = ""  # of the command's help that is about this form of it
         self.given: list[str] = []
 
     def parse_known_intermixed_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -137,13 +138,13 @@ class PlainParser(argparse.ArgumentParser):
         unknown = re.search(r"unrecognized arguments: (-\S+)", message)
         name = unknown[1].partition("=")[0] if unknown else ""
         hint = self.closest(name) if unknown else ""
-        hint = f"; {self.elsewhere[name]}" if name in self.elsewhere else hint
+        hint = f"; {elsewhere}" if (elsewhere := self.elsewhere.get(name.partition(".")[0])) else hint
         message = f"no option {name}" if unknown else plainly(message)  # as the commands with a Trainer say it
         said = self.given
         several = [flag for each in self._actions if each.nargs == "+" for flag in each.option_strings if flag in said]
         if message.endswith("required: OUT") and several:
             hint = f"; files stand first, then options, for {several[0]} takes all words behind it"
-        print(refused(self.command, message + hint + unquoted(said)), file=sys.stderr)
+        print(refused(self.command, message + hint + unquoted(said), self.topic), file=sys.stderr)
         sys.exit(2)
 
 

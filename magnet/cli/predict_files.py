@@ -62,6 +62,9 @@ OF_EXPORT = (
 )
 """Options of `magnet export`, which writes what was predicted in other ways."""
 
+OF_DATA_SETS = ("--config", "--data", "--model", "--trainer", "--baselines")
+"""Options of `magnet predict` without files, which samples a data set."""
+
 
 COUNTS = {"frames": (1, 1_000_000), "context": (0, 1_000_000), "samples": (1, 10_000)}
 """The least and the most that is taken; more, nine hours of motion, is a slip."""
@@ -92,7 +95,13 @@ def _names_files(arguments: Sequence[str]) -> bool:
 
 def parser() -> argparse.ArgumentParser:
     options = scene_files.parser_of("predict", __doc__, EPILOG, inputs="*")
-    options.elsewhere = dict.fromkeys(OF_EXPORT, "magnet export chooses it: write an .npz, then export that")
+    options.topic = "files"
+    options.elsewhere = {
+        **dict.fromkeys(OF_EXPORT, "magnet export chooses it: write an .npz, then export that"),
+        **dict.fromkeys(OF_DATA_SETS, "it is for a data set, which is sampled without files"),
+        **dict.fromkeys(("--picture", "--pictures"), "with files the suffix of --out says what is written"),
+        "--view": "magnet view FILE shows what was written",
+    }
     options.add_argument("--out", nargs="+", action="extend", **scene_files.OUT)
     add = options.add_argument_group("what is sampled").add_argument
     add("--task", metavar="NAME", help="magnet tasks lists them (default: joint_future; generation)")
