@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -27,7 +27,6 @@ from magnet.body.contact import DEEP, deepest
 from magnet.generation.crowd import CrowdRollout
 from magnet.generation.crowd_settling import settled_moments
 from magnet.generation.crowd_start import START
-from magnet.generation.rollout import CHUNK
 from magnet.generation.stats import SamplingStats
 from magnet.metrics import Floating, FootSkating
 from magnet.motion.scene import FPS, Scene, cat_time
@@ -89,8 +88,8 @@ def rolled(
 ) -> Iterator[Scene]:
     """A crowd that goes on from a start, chunk by chunk."""
     generator = torch.Generator().manual_seed(1)
-    rest = model.sampler, generator, progress, stats, CHUNK
-    return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, *rest).chunks()
+    more: dict[str, Any] = {"options": model.sampler, "generator": generator, "progress": progress, "stats": stats}
+    return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, **more).chunks()
 
 
 def couples(model: magnet.Model, people: int) -> list[Scene]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import receptive_field
-from magnet.generation.rollout import CHUNK, Rollout
+from magnet.generation.rollout import Rollout
 from magnet.generation.settling import PACE, carried_on
 from magnet.motion.frames import canonical_frame, pairwise, to_9d
 from magnet.motion.scene import Scene, cat_time
@@ -82,7 +82,7 @@ class OwnRollout(Rollout):
             raise ValueError("settle_blocks: got true, expected false: tokens that are told stay as they were made")
         if isinstance(task, AgenticSync):  # who does not see the others is placed by the own deltas
             options = dataclasses.replace(options, placement="integrate")
-        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
+        super().__init__(model, past, task, past.frames, None, 1, options, generator)
         self.in_step = isinstance(task, AgenticSync)
         self.agent, self.names = agent, past.agents
         self.row = past.frames // TOKEN_FRAMES  # the next that is generated

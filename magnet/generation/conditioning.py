@@ -249,3 +249,27 @@ def spans(finished: Tensor, placed: Tensor, first: int, stop: int) -> list[tuple
     change = (pattern[1:] != pattern[:-1]).any(dim=1).nonzero()[:, 0] + first + 1
     edges = [first, *change.tolist(), stop]
     return [(start, end) for start, end in itertools.pairwise(edges) if bool(finished[start].any())]
+
+
+def window_condition(cond: Tensor | None, start: int, batch: int, width: int, guided: bool) -> Tensor | None:
+    """What a window is conditioned on, for all views of each scene; NaN where nothing is said.
+
+    Args:
+        cond: (B, C), or (B, N, C) for each token step.
+        start: the window's first token step.
+        batch: windows in all, a multiple of B.
+        width: token steps of a window.
+        guided: whether every second window goes without, for classifier-free guidance.
+
+    Returns:
+        (batch, C) or (batch, width, C); None where there is no condition.
+    """
+    if cond is None:
+        return None
+    if cond.ndim == 3:
+        cond = cond[:, start : start + width]
+        cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
+    cond = cond.repeat_interleave(batch // len(cond), dim=0)
+    if guided:
+        cond[1::2] = torch.nan
+    return cond

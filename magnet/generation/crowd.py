@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settl
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
 from magnet.generation.inputs import check_condition
 from magnet.generation.loaded import Loaded, denoiser_of
-from magnet.generation.rollout import CHUNK, Rollout
+from magnet.generation.rollout import Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import from_9d, inverse, project_se2, to_9d, to_planar
@@ -78,16 +79,17 @@ def generate_crowd(
     model, made = denoiser_of(model), []
     for number in range(scene.scenes * samples):
         which = [number // samples]
-        more = (options, generator, progress, stats, CHUNK, None if cond is None else cond[which])
+        more: dict[str, Any] = {"options": options, "generator": generator, "progress": progress, "stats": stats}
+        more["cond"] = None if cond is None else cond[which]
         one = scene.select(which)
         if scene.agents > model.layout.agents and context == 0 and isinstance(task, Generation):
             require_crowd(model, one, TOKEN_FRAMES, options or SamplerOptions())
             start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
-            whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *more).chunks()))
+            whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, **more).chunks()))
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
             whole = whole.replace(given=nobody).slice(0, frames)
         else:
-            rollout = CrowdRollout(model, one, task, context, frames, *more)
+            rollout = CrowdRollout(model, one, task, context, frames, **more)
             whole = cat_time(list(rollout.chunks()))
             if rollout.world.causal:  # whoever lives now does not make way for what is to come
                 made.append(whole)
@@ -100,7 +102,7 @@ class CrowdRollout(Rollout):
     """A rollout of one scene whose network sees views of it.
 
     Where a token has no slot for two people of a view, how they stand is worked out from what the view's ego expects
-    of both. `views` are those of now.
+    of both. `views` are those of now. Arguments as for `Rollout`, of one sample.
     """
 
     def __init__(
@@ -112,10 +114,7 @@ class CrowdRollout(Rollout):
         frames: int | None,
         options: SamplerOptions | None = None,
         generator: torch.Generator | None = None,
-        progress: Callable[[int], None] | None = None,
-        stats: SamplingStats | None = None,
-        chunk: int = CHUNK,
-        cond: Tensor | None = None,
+        **more: Any,
     ) -> None:
         self.crowd = scene.agents > model.layout.agents
         if self.crowd:
@@ -132,7 +131,7 @@ class CrowdRollout(Rollout):
         self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with
         people = scene.pad_agents(max(scene.agents, model.layout.agents))
         self._look_around(people, context)
-        super().__init__(self.model, scene, task, context, frames, 1, options, generator, progress, stats, chunk, cond)
+        super().__init__(self.model, scene, task, context, frames, 1, options, generator, **more)
         if self.crowd:
             self.world.decode_rows = self._decode_rows
             self.world.steer = None if self.world.causal else self._steer  # nobody gives way to what is not seen yet

@@ -9,7 +9,7 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.options import Sampling
 from magnet.generation.conditioning import mask_unknown, receptive_field
 from magnet.generation.inputs import check_given
-from magnet.generation.rollout import CHUNK, Generators, Rollout
+from magnet.generation.rollout import Generators, Rollout
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.options import SamplerOptions
@@ -52,7 +52,7 @@ class OnlineRollout(Rollout):
         self.base = 0  # the row that the recording, as far as it is held, begins with
         # With corrections an answer takes half as long again (docs/speed.md): they have to be asked for.
         options = (options or SamplerOptions()).filled(Sampling(settle="off"))
-        super().__init__(model, past, task, past.frames, None, 1, options, generator, None, None, CHUNK)
+        super().__init__(model, past, task, past.frames, None, 1, options, generator)
         self.there = past.frames // TOKEN_FRAMES
         self.scene = mask_unknown(self.scene, self._known(0, self.there))
         self._advance()

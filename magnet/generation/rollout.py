@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from magnet.generation.conditioning import (
     receptive_field,
     require_people,
     task_lookahead_limit,
+    window_condition,
 )
 from magnet.generation.expected import Expected, views
 from magnet.generation.inputs import check_condition, check_given, check_request, whole_tokens
@@ -93,8 +95,8 @@ def generate(
         ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
-    more = (options, generator, progress, stats)
-    rollout = Rollout(denoiser_of(model), scene, task, context, frames, samples, *more, CHUNK, cond, slots)
+    more: dict[str, Any] = {"progress": progress, "stats": stats, "cond": cond, "slots": slots}
+    rollout = Rollout(denoiser_of(model), scene, task, context, frames, samples, options, generator, **more)
     return cat_time(list(rollout.chunks()))
 
 
@@ -132,8 +134,8 @@ def stream(
         chunk = None if options.settle == "off" else CHUNK
     if chunk is not None:
         require_whole("chunk", chunk, 1)
-    more = (options, generator, progress, stats, chunk, cond)
-    return Rollout(denoiser_of(model), scene, task, context, frames, samples, *more).chunks()
+    more: dict[str, Any] = {"progress": progress, "stats": stats, "cond": cond, "chunk": chunk}
+    return Rollout(denoiser_of(model), scene, task, context, frames, samples, options, generator, **more).chunks()
 
 
 class Rollout:
@@ -152,12 +154,13 @@ class Rollout:
         task: Task,
         context: int,
         frames: int | None,
-        samples: int,
-        options: SamplerOptions | None,
-        generator: Generators,
-        progress: Callable[[int], None] | None,
-        stats: SamplingStats | None,
-        chunk: int | None,
+        samples: int = 1,
+        options: SamplerOptions | None = None,
+        generator: Generators = None,
+        *,
+        progress: Callable[[int], None] | None = None,
+        stats: SamplingStats | None = None,
+        chunk: int | None = CHUNK,
         cond: Tensor | None = None,
         slots: int = 0,
     ) -> None:
@@ -327,23 +330,12 @@ class Rollout:
             noisy = torch.nn.functional.pad(noisy, (0, 0, 0, 0, 0, self._ahead))
             levels = torch.nn.functional.pad(levels, (0, 0, 0, self._ahead), value=LEVELS)
         with torch.autocast(*self._autocast), without_dropout(self.model.transformer):
-            cond = self._condition(*noisy.shape[:2])
+            guided = bool(self.options.guidance.cond_weight)
+            cond = window_condition(self.cond, self.begins, len(noisy), noisy.shape[1], guided)
             clean = answered(self.model, noisy, levels, present, cond, self.options.compile)
             clean = self.model.denoise(noisy, levels, present, cond, self._network()) if clean is None else clean
         self._clean = clean.detach().float()
         return clean.float()[:, : clean.shape[1] - self._ahead]
-
-    def _condition(self, batch: int, width: int) -> Tensor | None:
-        """The condition of a window, for all views and branches of guidance of each scene."""
-        if (cond := self.cond) is None:
-            return None
-        if cond.ndim == 3:
-            cond = cond[:, self.begins : self.begins + width]
-            cond = torch.nn.functional.pad(cond, (0, 0, 0, width - cond.shape[1]), value=torch.nan)
-        cond = cond.repeat_interleave(batch // len(cond), dim=0)
-        if self.options.guidance.cond_weight:
-            cond[1::2] = torch.nan
-        return cond
 
     @torch.no_grad()
     def _decoded(self, start: int, stop: int, before: Scene | None, needed: int) -> Scene:

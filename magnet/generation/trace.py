@@ -78,7 +78,7 @@ class TracedRollout(Rollout):
         every: int,
     ) -> None:
         whole = -(-(context + frames) // TOKEN_FRAMES)  # one chunk, so that no row is let go
-        super().__init__(model, scene, task, context, frames, 1, options, generator, None, None, whole)
+        super().__init__(model, scene, task, context, frames, 1, options, generator, chunk=whole)
         self.every = every
         self.level = initial_levels(self.known)
         self.levels: list[Tensor] = []

@@ -249,7 +249,7 @@ class Scene:
         except (OSError, KeyError, TypeError, ValueError, *DAMAGED) as error:
             if isinstance(error, FileNotFoundError):
                 raise
-            raise ValueError(f"{path}: not a scene file ({error}); magnet.read takes files of other programs") from error
+            raise ValueError(f"{path}: not a scene file ({error}); magnet.read takes other files") from error
         if version > SCENE_FORMAT:
             raise ValueError(f"{path}: scene format {version}, this version reads up to {SCENE_FORMAT}")
         if missing := [name for name in TENSORS[:4] if name not in arrays]:

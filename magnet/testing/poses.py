@@ -130,7 +130,7 @@ class Run:
         """The first rows, and some more. other (N, P) bool, tokens whose noise is another one"""
         context, frames = self.grid.context * TOKEN_FRAMES, (self.grid.tokens - self.grid.context) * TOKEN_FRAMES
         generator = torch.Generator().manual_seed(4)
-        stream = Rollout(self.model, scene, self.task, context, frames, 1, self.options, generator, None, None, chunk=1)
+        stream = Rollout(self.model, scene, self.task, context, frames, 1, self.options, generator, chunk=1)
         if other is not None:
             stream.noise = OtherNoise(stream.noise, other)
         return cat_time(list(itertools.islice(stream.chunks(), min(rows + AFTER, self.grid.tokens))))

@@ -264,7 +264,10 @@ def test_a_crowd_comes_from_nothing_as_far_apart_as_is_said(tmp_path, capsys) ->
             ("BVH --out a.npz --task inbetweening --task.evry 3", "did you mean --task.every?"),
             ("BVH --out a.npz --spacing 4", "--spacing 4: places the groups of a crowd, which begins above 4 people"),
             ("BVH --out a.npz --fps 60", "magnet export chooses it: write an .npz, then export that"),
-            ("BVH --out a.npz --picture mp4", "the suffix of --out says what is written. See magnet predict --help files"),
+            (
+                "BVH --out a.npz --picture mp4",
+                "suffix of --out says what is written. See magnet predict --help files",
+            ),
             ("BVH --out a.npz --data.root x", "no option --data.root; it is for a data set, which is sampled without"),
             ("none.bvh --out a.npz", "none.bvh: no such file"),
             ("none.npz --task joint_future", "none.npz: no such file"),

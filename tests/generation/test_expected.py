@@ -74,7 +74,7 @@ def test_whoever_is_made_later_is_expected_in_the_block_alike_in_every_precision
             SamplerOptions(steps=2, settle="firm", precision=precision),
             torch.Generator().manual_seed(1),
         )
-        rollout = Rollout(model, scene, task, 16, 16, 1, options, generator, None, None, chunk=1)
+        rollout = Rollout(model, scene, task, 16, 16, 1, options, generator, chunk=1)
         list(itertools.islice(rollout.chunks(), 5))
         ahead = rollout.expected.behind(rollout.expected.row)
         assert isinstance(ahead, Ahead) and ahead.within.shape[2] == 1

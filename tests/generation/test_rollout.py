@@ -227,7 +227,7 @@ def test_no_more_rows_are_held_for_a_longer_scene(model, name):
     def most_rows(frames: int) -> int:
         context = context_of(name)
         options = SamplerOptions(steps=1, stride=4)
-        stream = Rollout(model, scene, TASKS[name], context, frames - context, 1, options, None, None, None, 4)
+        stream = Rollout(model, scene, TASKS[name], context, frames - context, 1, options, chunk=4)
         held = 0
         for _ in stream.chunks():
             held = max(held, stream.tokens.shape[1] + stream.mask_noise.shape[1])
