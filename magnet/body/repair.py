@@ -226,6 +226,7 @@ def settling(
     slides: float = SLIDES,
     holding: Tensor | None = None,
     last: tuple[Tensor, Tensor] | None = None,
+    guess: Tensor | None = None,
 ) -> Tensor:
     """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
@@ -238,9 +239,9 @@ def settling(
     for start in range(0, B, few):
         some = slice(start, start + few)
         still = fixed_of(fixed, some, B)
-        before, hold = (None if each is None else each[some] for each in (past, holding))
+        before, hold, first = (None if each is None else each[some] for each in (past, holding, guess))
         ends = None if last is None else (last[0][some], last[1][some])
-        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold, ends))
+        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold, ends, first))
     return torch.cat(made)
 
 
@@ -255,6 +256,7 @@ def _settling(
     slides: float,
     holding: Tensor | None,
     last: tuple[Tensor, Tensor] | None,
+    guess: Tensor | None,
 ) -> Tensor:
     held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
     toward = kept_apart(body.joints(held), scene.present, fixed, TOO_DEEP[FIRM.get(how, how)], begun, scene.fps)
@@ -266,7 +268,7 @@ def _settling(
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
     if how == "hold":
         settle = replace(settle, tilt=UPRIGHT)
-    return correction(scene, body, wishes, fixed, settle, begun, past, toward)
+    return correction(scene, body, wishes, fixed, settle, begun, past, toward, guess)
 
 
 def between_frames(offset: Tensor, few: Tensor, frames: int) -> Tensor:

@@ -122,6 +122,7 @@ def correction(
     begun: bool = False,
     past: Tensor | None = None,
     toward: Tensor | None = None,
+    guess: Tensor | None = None,
 ) -> Tensor:
     """The correction of a scene's poses that meets the wishes, for `corrected`. -> (B, T, P, DOFS)
 
@@ -132,6 +133,8 @@ def correction(
         begun: the motion continues a past that stays, so corrections grow from 0.
         past: (B, 2, P, DOFS) corrections of the two frames before, which are continued; None: see `begun`.
         toward: (B, T, P, 2) metres that people are first moved over the ground: decides who ends on which side.
+        guess: (B, T, P, DOFS) a correction to begin with, 0 where nobody may move; None: the last of `past`, moved
+            `toward` there.
     """
     T = scene.frames
     if T > WINDOW + AHEAD:
@@ -139,12 +142,12 @@ def correction(
         for start in range(0, T, WINDOW):
             stop = min(start + WINDOW + AHEAD, T)
             stay = fixed_in(fixed, slice(start, stop))
-            push = None if toward is None else toward[:, start:stop]
-            more = (stay, settle, begun or start > 0, parts[-1][:, -LEAD:] if parts else past, push)
+            push, first = (None if each is None else each[:, start:stop] for each in (toward, guess))
+            more = (stay, settle, begun or start > 0, parts[-1][:, -LEAD:] if parts else past, push, first)
             made = correction(scene.slice(start, stop), body, wishes.slice(start, stop), *more)
             parts.append(made[:, :WINDOW])
         return torch.cat(parts, dim=1)
-    return correct_window(scene, body, wishes, fixed, settle or Settle(), begun, past, toward)
+    return correct_window(scene, body, wishes, fixed, settle or Settle(), begun, past, toward, guess)
 
 
 def correct_window(
@@ -156,6 +159,7 @@ def correct_window(
     begun: bool,
     past: Tensor | None,
     toward: Tensor | None,
+    guess: Tensor | None,
 ) -> Tensor:
     """`correction` of frames that are corrected together."""
     B, T, P = scene.T_world_root.shape[:3]
@@ -174,7 +178,7 @@ def correct_window(
         smooth.start = smooth.toward(torch.where(free[..., None], toward, 0.0))
     if past is not None:
         offset = torch.where(free[..., None], past[:, -1:], offset)
-    offset = offset + smooth.start
+    offset = offset + smooth.start if guess is None else guess
     rest = body.rest_joints(scene.betas[:, None])
     capsules = with_measured(fit_capsules(body, scene.betas), rest)
     few = (free.flatten(1).sum(dim=1) <= SOLVED_AT_ONCE)[

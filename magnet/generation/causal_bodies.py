@@ -12,7 +12,8 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.generation.blending import freeze_after, smoothed_path, spring_from_given
 from magnet.generation.conditioning import receptive_field, require_finite
 from magnet.generation.expected import Ahead, of_itself
-from magnet.generation.settling import PACE, Corrected, Later, settled_on
+from magnet.generation.live_settling import Later, settled_on
+from magnet.generation.settling import PACE, Corrected
 from magnet.motion.frames import POSE_FEATURES, from_9d, posed, project_se2, to_9d
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
@@ -99,8 +100,7 @@ def _settled(world: World, made: Scene, stop: int, how: str, tokens: Tensor, exp
     uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     sees = (world.saw & world.placed[rows].all(dim=0)).to(new.device)
     later = None if expected is None else expectation(world, tokens, stop, made.frames // TOKEN_FRAMES, expected)
-    corrected, correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected, later)
-    world.correction = correction._replace(offset=correction.offset[:, own - LEAD : own])
+    corrected, world.correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected, later)
     return corrected.slice(0, own)
 
 

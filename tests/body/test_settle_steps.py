@@ -16,7 +16,7 @@ from magnet.body.repair import settling
 from magnet.body.settle import DOFS, SOLVED_AT_ONCE
 from magnet.body.settle_residuals import Residuals
 from magnet.body.settle_steps import TOGETHER, Settle, Smoothness, alike, exact_step, solve, stiffness
-from magnet.generation.settling import SHOWN
+from magnet.generation.live_settling import SHOWN
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import Scene, concatenate
@@ -151,6 +151,19 @@ def test_few_poses_are_solved_at_once_and_a_scene_s_correction_is_its_own() -> N
     assert float(whole[0].abs().max()) > 0.02
     for number, one in enumerate((deep, scene, alone)):
         assert torch.allclose(settling(one, BODY, "firm", settle=SHOWN)[0], whole[number], atol=1e-4), number
+
+
+def test_a_correction_goes_on_from_a_first_guess() -> None:
+    """Two halves of the steps, the second from where the first has ended, are all of them."""
+    scene = standing_scene(frames=8)
+    root = scene.T_world_root.clone()
+    root[..., 1, 0, 3] = root[..., 0, 0, 3] + 0.15
+    deep = scene.replace(T_world_root=root)
+    one, two = replace(SHOWN, iterations=1), replace(SHOWN, iterations=2)
+    begun = settling(deep, BODY, "firm", settle=one)
+    kept, whole = begun.clone(), settling(deep, BODY, "firm", settle=two)
+    gone_on = settling(deep, BODY, "firm", settle=one, guess=begun)
+    assert torch.equal(gone_on, whole) and torch.equal(begun, kept) and not torch.equal(begun, whole)
 
 
 def test_the_shoulder_girdle_turns_where_that_costs_something_finite() -> None:

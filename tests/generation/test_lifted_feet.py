@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from magnet.body.repair import repaired
-from magnet.generation.settling import settled_chunk, settled_on
+from magnet.generation.live_settling import settled_on
+from magnet.generation.settling import settled_chunk
 from tests.gliding import BODY, gliding, rise
 
 

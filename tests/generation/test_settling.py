@@ -15,9 +15,8 @@ from magnet.body.apart import Apart
 from magnet.body.contact import deepest
 from magnet.body.energy import CONTACT
 from magnet.body.holding import holds
-from magnet.body.joints import TOES
 from magnet.body.settle import DOFS
-from magnet.body.settle_wishes import FIRM, LAG
+from magnet.body.settle_wishes import FIRM
 from magnet.generation import settling
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.causal_bodies import EXPECTED
@@ -26,16 +25,12 @@ from magnet.generation.settling import (
     FINISHED,
     GLIDE,
     PACE,
-    REMEMBERED,
-    Corrected,
     around,
     carried_on,
-    parted_for,
     settled_chunk,
-    settled_on,
 )
 from magnet.metrics import hand_distance
-from magnet.motion.scene import Scene, cat_time
+from magnet.motion.scene import Scene
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions, Separation, Settling
 from magnet.sampling.schedule import Grid
@@ -154,96 +149,6 @@ def test_hands_hold_on_from_a_chunk_to_the_next() -> None:
     assert together(settled_chunk(apart, nobody, "firm", past)[0]) < 3
 
 
-def test_hands_that_held_hold_before_the_next_block_and_are_remembered_for_a_while() -> None:
-    body, who = load_body(), (0, 1)
-    shake = synthesize("handshake", 2, 150, torch.Generator().manual_seed(1), body).scene.slice(56, 60)
-    away = (shake.T_world_root[:, :, 1, :3, 3] - shake.T_world_root[:, :, 0, :3, 3]) * torch.tensor([1.0, 0.0, 1.0])
-
-    def moved(metres: float) -> Scene:
-        root = shake.T_world_root.clone()
-        root[:, :, 1, :3, 3] += metres * away / away.norm(dim=-1, keepdim=True)
-        return shake.replace(T_world_root=root)
-
-    def after(scene: Scene, parted: torch.Tensor | None, who: tuple[int, ...] = who) -> torch.Tensor:
-        past = None if parted is None else Corrected(torch.zeros(1, 2, 2, DOFS), parted, (0, 1))
-        return parted_for(scene, body.joints(scene), past, who, 4)
-
-    held = holds(body.joints(shake), shake.present)[0][:, -1]
-    met = after(shake, None)
-    assert held.any() and torch.equal(met == 0, held) and met[~held].isinf().all()
-    assert torch.equal(after(moved(0.3), met) == 0, held)  # they have not parted
-    assert after(moved(0.3), None).isinf().all()  # nobody remembers that they met
-    assert after(moved(0.3), met, (0, 2)).isinf().all()  # others met
-    parted = after(moved(0.8), met)
-    assert (parted[held] == 4).all()
-    for _ in range(REMEMBERED // 4 - 1):
-        parted = after(moved(0.8), parted)
-    assert (parted[held] == REMEMBERED).all()
-    assert torch.equal(after(moved(0.3), parted) == 0, held)  # near again soon enough
-    forgotten = after(moved(0.8), parted)
-    assert (forgotten[held] == REMEMBERED + 4).all()
-    assert (after(moved(0.3), forgotten) > REMEMBERED).all()
-
-
-def glided(speed: float, frames: int, block: int = 4) -> tuple[Scene, Scene]:
-    """One who stands and whom the model moves on at so many m/s, as shown block by block, and as it was made."""
-    still = standing(1, frames, 1, torch.device("cpu"))
-    root = still.T_world_root.clone()
-    root[0, :, 0, 0, 3] += speed * (torch.arange(frames) - block).clamp(min=0) / 30.0
-    sliding = still.replace(T_world_root=root)
-    new, sees = torch.ones(block + BEHIND, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
-    shown, past, plain = [sliding.slice(0, block)], None, None
-    for start in range(block, frames - BEHIND, block):
-        ahead = sliding.slice(start, start + block + BEHIND)
-        made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
-        shown.append(made.slice(0, block))
-        past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
-    return cat_time(shown), sliding
-
-
-def test_feet_shown_standing_stay_there_block_after_block() -> None:
-    """While the model moves the body on at 0.15 m/s; corrected block by block, each knowing what was shown alone."""
-    frames, body = 36, load_body()
-    toes, slid = (body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in glided(0.15, frames))
-    last = frames - BEHIND - 4
-    assert float((slid[last] - slid[0]).mean()) > 0.09
-    assert float((toes[last] - toes[0]).abs().max()) < 0.03
-    assert float(toes.diff(dim=0).abs().max()) < 0.005
-
-
-def test_feet_that_a_gliding_body_has_left_behind_are_let_go() -> None:
-    """While the model glides on at 0.4 m/s for half a metre with both feet down: nobody leans after them."""
-    body, frames = load_body(), 48
-    shown, sliding = (each.slice(0, frames - 8) for each in glided(0.4, frames))
-    feet = [body.joints(each.replace(body=body.id))[0, :, 0][:, TOES, 0] for each in (shown, sliding)]
-    lag = (feet[1] - feet[0]) - (sliding.T_world_root - shown.T_world_root)[0, :, 0, 0, 3, None]
-    assert float((feet[1][-1] - feet[1][0]).min()) > 0.4
-    assert 0.10 < float(lag.max()) < LAG + 0.08
-
-
-def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Scene:
-    """Shown block by block: the model lets A walk through B, who stands. Scenes but the first: A stands, too."""
-    still = standing(scenes, frames, 2, torch.device("cpu"))
-    root = still.T_world_root.clone()
-    root[:, :, 0, 0, 3], root[:, :, 0, 2, 3] = root[:, :, 1, 0, 3] - 0.8, root[:, :, 1, 2, 3]
-    root[0, :, 0, 0, 3] += speed / 30 * (torch.arange(frames) - block).clamp(min=0)
-    walking, body = still.replace(T_world_root=root), load_body()
-    new = torch.tensor([True, False]).expand(block + BEHIND, -1)
-    shown, past, plain = [walking.slice(0, block)], None, None
-    for start in range(block, frames - BEHIND, block):
-        ahead = walking.slice(start, start + block + BEHIND)
-        made, now = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past, plain)
-        shown.append(made.slice(0, block))
-        past, plain = Corrected(now.offset[:, block - 2 : block], now.parted, now.who), ahead.slice(block - 2, block)
-    return cat_time(shown).replace(body=body.id)
-
-
-@pytest.mark.parametrize("speed", few([1.0, 1.5], 1))
-def test_whoever_would_walk_through_somebody_is_kept_out_block_by_block(speed) -> None:
-    joints = load_body().joints(walked_on(1, speed))[0]
-    assert float(deepest(joints[:, 0], joints[:, 1])[:, 1].max()) < 0.08
-
-
 def test_what_is_left_deep_in_a_finished_chunk_is_corrected_anew_and_nobody_is_thrown(monkeypatch) -> None:
     """A runs through B, who is given, at 11 m/s, and back at once, beside a scene in which nobody moves."""
     still, body = standing(2, 40, 2, torch.device("cpu")), load_body()
@@ -307,36 +212,6 @@ def test_people_who_may_not_be_moved_are_not_corrected_anew(monkeypatch) -> None
     monkeypatch.setattr(settling, "settling", lambda *words, **more: calls.append(1) or plain(*words, **more))
     settled_chunk(scene, fixed, "firm", None)
     assert len(calls) == 1
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_whoever_is_given_the_block_is_made_way_for_in_it(known) -> None:
-    """B comes at A at 2.5 m/s from half a metre, and stands until the block begins: who sees the block steps aside."""
-    frames, block, body = 12, 4, load_body()
-    still = standing(1, frames, 2, torch.device("cpu"))
-    root = still.T_world_root.clone()
-    root[0, :, 1, 2, 3] = root[0, :, 0, 2, 3]
-    root[0, :, 1, 0, 3] = root[0, :, 0, 0, 3] + 0.5 - 2.5 / 30 * (torch.arange(frames) - block + 1).clamp(0, block)
-    scene = still.replace(T_world_root=root)
-    new, sees = torch.tensor([True, False]).expand(2 * block, -1), torch.tensor([[False, known], [False, False]])
-    before, plain = scene.slice(0, block), scene.slice(block, frames)
-    made, _ = settled_on(plain, before, new, block, sees, "firm", None)
-    assert torch.equal(made.T_world_root[:, :, 1], plain.T_world_root[:, :, 1])
-    was, now = (
-        deepest(*body.joints(each.replace(body=body.id))[0, :block].unbind(dim=1))[-1, 1] for each in (plain, made)
-    )
-    assert (float(now) < float(was) - 0.02) == known
-    later = plain.T_world_root.clone()
-    later[:, block:, 1, 0, 3] += 1.0
-    again, _ = settled_on(plain.replace(T_world_root=later), before, new, block, sees, "firm", None)
-    assert torch.equal(again.T_world_root[:, :, 0], made.T_world_root[:, :, 0])  # nobody knows what comes after
-
-
-def test_corrections_made_anew_in_one_scene_change_no_other() -> None:
-    two, one = walked_on(2, 1.0, frames=28), walked_on(1, 1.0, frames=28)
-    torch.testing.assert_close(two.select(torch.tensor([0])).T_world_root, one.T_world_root, rtol=0, atol=1e-5)
-    still = walked_on(2, 0.0, frames=28)
-    torch.testing.assert_close(two.T_world_root[1], still.T_world_root[1], rtol=0, atol=1e-5)
 
 
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
