@@ -23,7 +23,7 @@ for example:
   magnet report 3 --dry_run            the cells of Table 3, and how long they may take
   magnet report 4 A.4 leak --shipped   what needs no training
   magnet report all                    a day on two cores, trainings included
-  magnet report 5 --data configs/paper/data/duobox.yaml --budget paper
+  magnet report 5 --budget paper --data configs/paper/data/duobox.yaml --configs configs/paper/ablations
 """
 
 

@@ -30,7 +30,8 @@ class Budget:
         frames: of a long generation.
         speed_rounds: how often a speed is taken.
         batch: windows of a training step; None: as the configuration says.
-        whole_benchmark: measure the open benchmark as its page asks, whatever `scenes` and `samples` say.
+        whole_benchmark: measure the open benchmark as its page asks, whatever the rest says.
+        sampler: preset that models are sampled by.
     """
 
     scenes: int
@@ -41,6 +42,7 @@ class Budget:
     speed_rounds: int
     batch: int | None = None
     whole_benchmark: bool = True
+    sampler: str = "default"
 
     @property
     def told(self) -> str:
@@ -48,14 +50,15 @@ class Budget:
         steps = "as configurations say" if self.steps is None else f"of {self.steps} steps"
         steps += "" if self.batch is None else f" of {self.batch} windows"
         words = [f"at most {self.scenes} test scenes", f"{self.samples} samples of each", f"{self.seeds} seeds"]
-        return ", ".join([*words, f"trainings {steps}", f"{self.frames} frames in a long generation"])
+        words += [f"trainings {steps}", f"{self.frames} frames in a long generation"]
+        return ", ".join(words if self.sampler == "default" else [*words, f"sampler {self.sampler}"])
 
 
 BUDGETS = {
     "tiny": Budget(2, 2, 2, 2, 40, 1, whole_benchmark=False),
     "evening": Budget(8, 2, 3, 200, 300, 4, batch=8),
     "small": Budget(8, 5, 3, None, 300, 3),
-    "paper": Budget(1_000_000, 10, 3, None, 1800, 5),
+    "paper": Budget(1_000_000, 10, 3, None, 1800, 5, sampler="paper"),
 }
 """`tiny` is for tests, `evening` for half a core and four hours, `small` for two cores and a day, `paper` for a GPU
 and the paper's own data."""
@@ -91,7 +94,7 @@ class Cell:
         model: what is measured or trained; None: baselines and floors.
         task: name of the task.
         task_options: as `name=value`, sorted.
-        sampler: options other than the budget's preset, as `name=value`, sorted.
+        sampler: options other than the default ones, as `name=value`, sorted; `preset` may be among them.
         leak: `pairs`: pairwise transforms are as clean as their token, the paper read literally.
         scenes: test scenes at most.
         samples: of each.

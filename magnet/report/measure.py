@@ -31,7 +31,6 @@ from magnet.motion.tokens import TokenLayout
 from magnet.report.cells import Cell
 from magnet.report.film import keep
 from magnet.report.folds import FoldScoring
-from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry as tasks
 from magnet.tasks.base import Task
 
@@ -96,8 +95,7 @@ def predictor(cell: Cell, data: MotionDataModule, checkpoint: str, horizon: int 
     if cell.leak == "pairs":
         layout = TokenLayout(model.layout.latent, model.layout.agents, model.layout.pairwise, "token")
         model.layout = model.transformer.layout = layout
-    sampler = SamplerOptions.preset("default", **dict(cell.sampler))
-    evaluator = Evaluator(model, task_of(cell), sampler, max(cell.samples, 1), baselines=False)
+    evaluator = Evaluator(model, task_of(cell), dict(cell.sampler), max(cell.samples, 1), baselines=False)
     evaluator.start(data)
     evaluator.horizon = horizon or evaluator.horizon
     return evaluator.predict_joints

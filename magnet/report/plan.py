@@ -122,7 +122,8 @@ class ReportOptions:
 
     def _cell(self, kind: Kind, seed: int, model: Weights | None, task: str, **options: Any) -> Cell:
         task_options = tuple(sorted(options.pop("task_options", {}).items()))
-        sampler = tuple(sorted(options.pop("sampler", {}).items()))
+        preset = {} if model is None or self.budget.sampler == "default" else {"preset": self.budget.sampler}
+        sampler = tuple(sorted({**preset, **options.pop("sampler", {})}.items()))
         cell = Cell(kind, seed, self.data, model, task, task_options, sampler)
         if kind == "measure":
             return replace(cell, scenes=self.budget.scenes, samples=self.budget.samples, **options)

@@ -12,9 +12,11 @@ from magnet.cli import score
 from magnet.evaluation.benchmark import SPLIT_FILE
 from magnet.evaluation.evaluator import Evaluator
 from magnet.motion.tokens import TokenLayout
+from magnet.report import measure
 from magnet.report.cells import BUDGETS
-from magnet.report.plan import PAPER
-from magnet.report.tables import TABLES, cells_of, named
+from magnet.report.plan import COLUMNS, PAPER
+from magnet.report.tables import OWN_PLACE, TABLES, cells_of, named
+from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.testing import random_scene, tiny_denoiser
 from tests.evaluation.test_evaluator import FAST, data
@@ -65,6 +67,33 @@ def test_the_open_benchmark_is_measured_as_magnet_score_measures_it_whatever_the
             assert (cell.scenes, cell.samples) == (len(split["scenes"]), split["samples"])
             assert cell.seed == score.parser().get_default("seed")
             assert cell.data == "salsa" and not cell.task_options and not cell.sampler
+
+
+def test_on_the_papers_budget_every_model_is_sampled_as_the_paper_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = replace(PLAN, budget=BUDGETS["paper"])
+    cells = cells_of(block for name, table in TABLES.items() if name != "benchmark" for block in table(plan))
+    asked = {cell.sampler: cell for cell in cells if cell.model is not None and cell.kind != "train"}
+    assert len(asked) == 2  # agents' noise joint, and independent
+    monkeypatch.setattr(measure, "load", lambda _: tiny_denoiser(max_agents=2))
+    for cell in asked.values():
+        method = measure.predictor(cell, data(max_agents=2), "some.ckpt")
+        noise = dict(cell.sampler).get("noise_sampling", "joint")
+        assert method.__self__.sampler == SamplerOptions.preset("paper", noise_sampling=noise)
+
+
+def test_an_ordering_is_that_of_the_printed_numbers_or_says_that_it_is_not() -> None:
+    """Of Table 3 the two tasks have tables of their own, of Table 4 the group sizes."""
+    for name, table in TABLES.items():
+        printed = PAPER["tables"].get(name, {})
+        for block in table(PLAN):
+            words = block.title.removeprefix("joint future of ").partition(",")[0]
+            near = {title: rows for title, rows in printed.items() if words in title} or printed
+            for claim in block.claims:
+                place = COLUMNS.index(claim.metric) if claim.metric in COLUMNS and claim.place != OWN_PLACE else None
+                for rows in near.values() if place is not None else ():
+                    both = [rows.get(row, [None] * 7)[place] for row in (claim.better, claim.worse)]
+                    if None not in both and sorted({*both}, reverse=not claim.lower) != both:
+                        assert "prints" in claim.place, f"{name}: {claim}"
 
 
 @pytest.mark.parametrize(("said", "meant"), [("3", "3"), ("a3", "A.3"), ("Fig7", "Fig. 7"), ("table5", "5")])
