@@ -28,8 +28,8 @@ class TransformerOptions:
         level_width: size of the level embedding.
         agent_width: size of the agent embedding.
         slot_width: size of the level embedding of each partner slot (ours).
-        rope: where time enters: `hidden` rotates the embedded token once, as in the paper, `heads` rotates queries and
-            keys, `none` leaves time out (ablation, paper Table A.5).
+        rope: where time enters: `hidden` adds the embedded token to itself rotated, once (paper Table A.2), `heads`
+            rotates queries and keys, `none` leaves time out (ablation, paper Table A.5).
         agent_embedding: false takes the agents' identities away (ablation, paper Table A.5).
         pairwise: false takes pairwise transforms out of the tokens (ablation, paper Table 5).
         causal_block: token steps of a block of attention; a token sees blocks up to its own (ours). 0: it sees
@@ -79,8 +79,8 @@ class NoiseOptions:
     """Which noise levels are trained on.
 
     Args:
-        distribution: how levels are drawn: `per_token` (paper 3.2), `per_timestep`, `per_sequence` (A.6.2), or
-            `mixture` (ours: these and the patterns that sampling asks about).
+        distribution: how levels are drawn: `per_token` (paper 3.2), `per_timestep` (A.6.2, read as a choice when
+            training), `per_sequence`, or `mixture` (ours: these and the patterns that sampling asks about).
         shift: over 1 draws high levels more often; see `magnet.sampling.noise.shifted`.
         pairwise: `noisier_end`: a pairwise transform is as noisy as the noisier of its two agents. `token`: one level a
             token as the paper reads literally, which leaks where unknown agents are.
@@ -176,7 +176,8 @@ class SelfForcing:
     changes no training.
 
     Args:
-        share: of training scenes with a past, how many show it as the model would make it.
+        share: of training scenes with a past, how many show it as the model would make it. With independent levels
+            hardly any has one.
         placement: how its deltas and pairwise transforms become world poses; see `magnet.motion.placement.place`.
         pairwise_weight: weight of a pairwise transform against a delta in the placement `fuse`.
         displaced: share of the training scenes in which people stand a little off at first and come back, as those must

@@ -57,7 +57,7 @@ class Evaluator(L.LightningModule):
         denoiser: the trained model; a peer answers in its own way, whatever the sampler, under its own name.
         task: what is sampled.
         sampler: how it is sampled, as options or a mapping of them.
-        samples: scenes drawn for each test scene (paper 4: 10).
+        samples: scenes drawn for each test scene; the paper does not say how many.
         baselines: also measure nearest neighbour, random sample and zero velocity, aligned with the context and as
             found, a ridge regression, training windows in place of samples, and how near samples come to these.
         seed: all noise follows from it. A sample's is its own, whatever else is in the batch, so that scores do not

@@ -1,4 +1,4 @@
-"""Metrics of generated motion: a pure function on joints, then a thin torchmetrics Metric (paper 4; A.4)."""
+"""Metrics of generated motion: a pure function on joints, then a thin torchmetrics Metric (paper 4)."""
 
 from __future__ import annotations
 

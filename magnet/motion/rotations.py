@@ -12,7 +12,7 @@ from torch.nn import functional as F
 def to_6d(rotation: Tensor) -> Tensor:
     """First two *columns* of a rotation matrix, one after the other. (..., 3, 3) -> (..., 6)
 
-    Libraries disagree on this: some use rows. Columns follow Zhou et al. 2019 and the paper (3.1).
+    Libraries disagree on this: some use rows. Columns follow Zhou et al. 2019; the paper (3.1) does not say.
 
     >>> to_6d(torch.eye(3))
     tensor([1., 0., 0., 0., 1., 0.])

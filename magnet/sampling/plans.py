@@ -31,8 +31,8 @@ def token_levels(grid: Grid) -> Tensor:
     `independent`: each token of each agent has levels of its own between K and 0, drawn evenly from 1..K-1 (and then
     `shifted`), or evenly in log-SNR. They are drawn from a fixed seed, the same for every scene.
 
-    Paper A.6.2 compares the two. It can be read as a choice when training (`noise_levels` of the denoiser) or when
-    sampling. It is a choice when sampling here, because both of the paper's rows are of one trained model.
+    Paper A.6.2 compares the two. It can be read as a choice when training (`noise.distribution` of the denoiser) or
+    when sampling. It is a choice when sampling here, because the paper trains with independent levels (3.2).
     """
     in_log_snr = grid.spacing == "log_snr"
     plan = log_snr_levels(grid.steps) if in_log_snr else ddim_levels(grid.steps, grid.shift)

@@ -20,9 +20,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pyramid_offset": 0,  # 3.3: segment by segment
         "opening": 0,
         "turn": 1,  # 3.3: P(A_t | ...), then P(B_t | A_t, ...)
-        "placement": "integrate",  # the paper predicts steps and integrates them
+        "placement": "integrate",  # the paper does not say; the released code's
         "pairwise_weight": 0.05,  # not read by `integrate`
-        "requantize": True,  # 3.1: what is decoded are codes
+        "requantize": True,  # the paper does not say; the released code's
         "keep_given": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding
         "eta": 0.0,  # A.3: DDIM

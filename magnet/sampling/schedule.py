@@ -228,9 +228,10 @@ class MaskSchedule:
     def pyramid(known: Tensor, target: Tensor, grid: Grid) -> MaskSchedule:
         """Denoise each token `grid.token_offset` denoising steps later than the one before it in time.
 
-        The plan is lower-triangular (paper 3.3; the pyramid schedule of diffusion forcing). Each stage finishes one
-        more token step. All tokens in flight and one more must fit into the window (`Grid.slides`). Where less than
-        half a window is given, the first window is denoised as a full sequence: there is too little to continue from.
+        The plan is lower-triangular: the pyramid schedule of diffusion forcing, which the paper (3.3) may mean. Each
+        stage finishes one more token step. All tokens in flight and one more must fit into the window (`Grid.slides`).
+        Where less than half a window is given, the first window is denoised as a full sequence: there is too little to
+        continue from.
 
         Args:
             known: (N, P) bool, given clean.

@@ -94,8 +94,8 @@ def toward_keys(known: Tensor, grid: Grid) -> MaskSchedule:
 def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
     """Positions of the window: (start, first token step to generate, one past the last), until all is done.
 
-    A gap shorter than the window is generated at once, with the keyframe after it in view. A longer gap is generated
-    stride by stride, and the rest at once when its end comes into view.
+    A gap that fits into the window, with a stride of past (half of the window at most) and the keyframe after it, is
+    generated at once. A longer gap is generated stride by stride, and the rest at once when its end comes into view.
     """
     N, W = len(known), grid.window
     coming = next_keys(known)
