@@ -18,7 +18,7 @@ from magnet.generation.settling import Corrected, carried_on, left_deep, since_h
 from magnet.motion.scene import Scene, cat_time
 
 SHOWN = Settle(
-    iterations=3,
+    iterations=4,
     inner=16,
     stay=2.0,
     speed=1.0,
@@ -41,8 +41,7 @@ Whole people are hardly moved, because who is moved four frames at a time change
 """
 
 PRESSED = tuple(
-    replace(SHOWN, iterations=steps, inner=40, bend=24000.0, root=root, stand=16.0, hold=2.0)
-    for root, steps in ((3.0, 3), (0.3, 4))
+    replace(SHOWN, iterations=3, inner=40, bend=24000.0, root=root, stand=16.0, hold=2.0) for root in (3.0, 0.3)
 )
 """How they are corrected, one going on from the other, while somebody is left deep in another (`LEFT`): moved out of
 the way as a whole, smoothly, for a hand that jumps is seen more than some centimetres of depth. The second moves people

@@ -125,7 +125,7 @@ def test_people_in_each_other_are_corrected_by_what_a_step_may_be(heavy: float) 
     settle = replace(SHOWN, stay=0.01, root=0.1, stand=heavy, swing=heavy, hold=heavy, hard=heavy)
     offset = settling(scene, body, "hold", settle=settle)
     assert offset.isfinite().all()
-    assert 0.1 < float(offset.abs().max()) <= 3 * 0.4 + 1e-4
+    assert 0.1 < float(offset.abs().max()) <= SHOWN.iterations * SHOWN.most + 1e-4
 
 
 def standing_scene(frames: int, people: int = 2) -> Scene:
