@@ -6,6 +6,7 @@ A replayed graph is one of them. What is recorded must take fixed shapes and nev
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,9 @@ Losses = Callable[[dict[str, Tensor], torch.Generator], dict[str, Tensor]]
 
 WARM_UP = 3
 """Runs before a recording, in which libraries start and tables are sent to the GPU."""
+
+_REPLAYING = threading.Lock()
+"""Threads that share a model share its graphs, each of which has one place for what goes in and one for what comes."""
 
 
 class CudaGraph:
@@ -71,7 +75,8 @@ def replayed(
     """
     device = next(iter(inputs.values())).device
     kind = (torch.is_autocast_enabled(device.type), torch.get_autocast_dtype(device.type), *kind_of(inputs))
-    with torch.inference_mode(False), torch.no_grad():  # what is recorded in inference mode is not written to outside
+    # What is recorded in inference mode is not written to outside.
+    with _REPLAYING, torch.inference_mode(False), torch.no_grad():
         if kind not in graphs:
             graphs[kind] = CudaGraph(lambda given, _: run(**given), inputs)
         made: Tensor = graphs[kind].replay(inputs)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -126,6 +128,21 @@ def test_evaluations_are_recorded_once_for_each_kind_and_handed_out_as_copies(st
     with torch.autocast("cpu", torch.bfloat16):
         replayed(graphs, lambda x: 2 * x, {"x": torch.ones(3)})
     assert len(graphs) == StandIn.recorded == 3
+
+
+def test_threads_that_share_a_graph_wait_for_each_other(stand_in: None) -> None:
+    graphs: dict[tuple[Any, ...], CudaGraph] = {}
+
+    def slow(x: Tensor) -> Tensor:
+        time.sleep(0.02)
+        return 2 * x
+
+    def asked(number: float) -> float:
+        return float(replayed(graphs, slow, {"x": torch.full((), number)}))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(asked, range(8))) == [2 * number for number in range(8)]
+    assert len(graphs) == StandIn.recorded == 1
 
 
 def test_what_else_losses_depend_on_is_recorded_anew_and_what_is_frozen_has_no_gradient(stand_in: None) -> None:

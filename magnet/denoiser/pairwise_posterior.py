@@ -117,13 +117,15 @@ class PairwisePosterior(nn.Module):
             return self._new_setting(levels, present, normalizer)
         levels, present, kept = levels[:1], present[:1], SETTINGS.of(self)
         key = (levels.numpy().tobytes(), present.numpy().tobytes(), *state_of([normalizer.mean, normalizer.std]))
-        if key not in kept:
-            if len(kept) == MOST_KEPT:
-                kept.pop(next(iter(kept)))
+        known = kept.get(key)
+        if known is None:
+            while len(kept) >= MOST_KEPT:
+                oldest, *_ = list(kept)  # at once: threads share a model
+                kept.pop(oldest, None)
             known = self._new_setting(levels, present, normalizer)
             # At once, though what is asked for once is not worth it: what was asked before must not change any bit.
-            kept[key] = replace(known, quick=QuickSetting.of(known, self.layout))
-        return kept[key]
+            known = kept[key] = replace(known, quick=QuickSetting.of(known, self.layout))
+        return known
 
     def _new_setting(self, levels: Tensor, present: Tensor, normalizer: Normalizer) -> Known:
         people = SlotsInUse.of(present, self.layout)

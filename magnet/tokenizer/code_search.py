@@ -49,7 +49,7 @@ class Book:
         """codes (codes, D) float32 on the CPU"""
         wide = min(DIMENSIONS, *codes.shape)
         # Any space gives right answers; one that was multiplied by the codes twice is near the best.
-        start = torch.randn(len(codes), wide, generator=torch.Generator().manual_seed(0))
+        start = torch.randn(len(codes), wide, generator=torch.Generator().manual_seed(0), dtype=torch.float32)
         basis = torch.linalg.qr(codes.T @ start).Q
         basis = torch.linalg.qr(codes.T @ (codes @ basis)).Q
         near = codes @ basis

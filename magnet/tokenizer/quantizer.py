@@ -153,12 +153,14 @@ class ResidualVQ(Float32):
         if self.training or self.codes.device.type != "cpu" or self.codes.is_inference():
             return []
         now = (self.codes.data_ptr(), self.codes._version)
-        if self._searched is None or self._searched[0] != now:
-            self._searched, self._lookups = (now, []), 0
+        kept = self._searched
+        if kept is None or kept[0] != now:
+            self._searched = kept = now, []
+            self._lookups = 0
         self._lookups += 1
-        if self._lookups == OFTEN:
-            self._searched[1].extend(Book.of(codes) for codes in self.codes)
-        return self._searched[1]
+        if self._lookups >= OFTEN and not kept[1]:  # all of them at once: threads share a model
+            self._searched = kept = now, [Book.of(codes) for codes in self.codes]
+        return kept[1]
 
     # -- following -----------------------------------------------------------------------------
 

@@ -1,14 +1,17 @@
 """Pairwise transforms as their posterior: never worse than what is shown, for any number of people."""
 
 import copy
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from magnet.denoiser import pairwise_posterior
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.pairwise_posterior import KNOTS, SHARPEST, SHARPEST_DELTA, PairwisePosterior
+from magnet.denoiser.quick_posterior import QuickSetting
 from magnet.motion.frames import from_9d, to_planar
 from magnet.motion.pose_graph import GAUGE
 from magnet.motion.tokens import by_frame, pairwise_by_frame
@@ -313,6 +316,29 @@ def test_what_is_kept_from_call_to_call_is_that_of_the_same_question(model: Deno
             assert torch.allclose(one, other, atol=1e-5)
         differ = [not torch.allclose(one, expected[0], atol=1e-4) for one in expected]
         assert differ == [False, True, True, True, False]
+
+
+def test_threads_that_share_it_keep_no_more_than_one_does(model: Denoiser, monkeypatch: pytest.MonkeyPatch):
+    """Another thread's question comes while the answer to one is being made, and then many more are asked."""
+    monkeypatch.setattr(pairwise_posterior, "MOST_KEPT", 2)
+    posterior, made, later = PairwisePosterior(model.layout), QuickSetting.of, []
+    _, guess, noisy, levels, present = shown(model, 100)
+
+    @torch.no_grad()
+    def ask(number: int) -> None:
+        posterior(guess, noisy, levels + number, present, model.normalizer)
+
+    def interrupted(*given: Any) -> QuickSetting:
+        if later:
+            ask(later.pop())
+        return made(*given)
+
+    monkeypatch.setattr(QuickSetting, "of", interrupted)
+    ask(0), ask(1)
+    later.append(2)
+    for number in range(3, 8):
+        ask(number)
+    assert not later and len(pairwise_posterior.SETTINGS.of(posterior)) == 2
 
 
 @pytest.mark.parametrize("people", [[], [1], [0, 2], [0, 1, 2]])

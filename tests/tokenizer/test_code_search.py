@@ -86,3 +86,33 @@ def test_numbers_that_are_none_are_no_error(generator):
     for _ in range(OFTEN):
         book.nearest(torch.zeros(1, 96))
     assert book.nearest(torch.full((2, 96), torch.nan)).shape == (2, 96)
+
+
+def test_threads_that_share_codes_never_search_some_of_the_books(generator, monkeypatch):
+    """Another thread's lookup is answered while books are being made: from all of them or from none."""
+    book, made, found, busy = quantizer(generator, 10, 0.05), Book.of, [], False
+
+    def interrupted(codes: Tensor) -> Book:
+        nonlocal busy
+        if not busy:
+            busy = True
+            found.append(len(book.books()))
+            busy = False
+        return made(codes)
+
+    monkeypatch.setattr(Book, "of", interrupted)
+    for _ in range(OFTEN):
+        book.nearest(torch.zeros(1, 96))
+    assert found and set(found) <= {0, 3}
+    assert len(book.books()) == 3
+
+
+def test_another_default_dtype_of_torch_changes_nothing(generator):
+    codes = quantizer(generator, 10, 0.05).codes[0]
+    whole = Book.of(codes)
+    torch.set_default_dtype(torch.float64)
+    try:
+        again = Book.of(codes)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert (again.basis == whole.basis).all() and again.basis.dtype == whole.basis.dtype
