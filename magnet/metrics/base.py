@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
@@ -18,6 +19,8 @@ from magnet.metrics.interval import bootstrap_interval
 from magnet.motion.scene import FPS
 
 Of = Literal["generated", "truth"]
+
+_NUMBERS = itertools.count()
 
 
 class MotionMetric(Metric):
@@ -49,6 +52,9 @@ class MotionMetric(Metric):
         require_choice("of", of, Of)
         require_number("fps", fps, over=0)
         self._empty: dict[str, Tensor] = {}  # states that are lists, as they are without a batch
+        # A MetricCollection has metrics whose sums are equal after a first batch (nobody floats, nobody sinks) share
+        # them for ever, unless something tells them apart.
+        self.add_state("number", torch.tensor(list(next(_NUMBERS).to_bytes(4))), dist_reduce_fx="max")
         self.of, self.fps = of, fps
         self.agents = agents[None] if agents is not None and agents.ndim == 2 else agents
 
@@ -66,6 +72,10 @@ class MotionMetric(Metric):
 
         `units` (B,) int says which clips are not independent of each other, see `bootstrap_interval`.
         """
+        # Sums grow in place: spawned processes share what they were sent, and inference mode's are closed outside it.
+        for name in self._defaults:
+            if isinstance(state := getattr(self, name), Tensor):
+                setattr(self, name, state.clone())
         if self.of == "truth" and getattr(generated, "ndim", 0) == 6:  # else `Futures.of` refuses it
             generated = truth[None, :, : generated.shape[2]]  # the frames that other rows are measured over
         if present is None:

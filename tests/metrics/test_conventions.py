@@ -6,7 +6,7 @@ import inspect
 
 import pytest
 import torch
-from torchmetrics import Metric
+from torchmetrics import Metric, MetricCollection
 
 from magnet import metrics
 from magnet.testing import standing_people
@@ -42,6 +42,46 @@ def test_everybody_is_present_where_nothing_is_said(kind: type[Metric]) -> None:
         results.append(metric.compute())
     assert results[0].keys() == results[1].keys()
     assert all(torch.equal(value, results[1][name]) for name, value in results[0].items())
+
+
+def test_a_collection_measures_what_each_metric_does_whatever_its_first_batch_was() -> None:
+    """In the first batch nobody moves, and what is generated is the recording."""
+    still = standing_people(40, 2)
+    moving = still + torch.linspace(0, 1, 40).square()[:, None, None, None]
+    batches = [(still[None], still), (moving[None] + 0.1, still - 0.1)]
+    kinds = {f"{kind.__name__} of {of}": kind(of=of) for kind in MADE for of in ("generated", "truth")}
+    together, expected = MetricCollection(kinds), {name: metric.clone() for name, metric in kinds.items()}
+    for batch in batches:
+        together.update(*batch)
+        for metric in expected.values():
+            metric.update(*batch)
+    for name, metric in expected.items():
+        torch.testing.assert_close(together[name].compute(), metric.compute(), msg=name)
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_a_batch_may_be_measured_in_inference_mode_and_the_next_outside(kind: type[Metric]) -> None:
+    truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None]
+    metric, expected = kind(), kind()
+    with torch.inference_mode():
+        metric.update(truth[None], truth)
+        metric.reset()
+        metric.update(truth[None] + 0.1, truth)
+    metric.update(truth[None] - 0.1, truth)
+    for by in (0.1, -0.1):
+        expected.update(truth[None] + by, truth)
+    torch.testing.assert_close(metric.compute(), expected.compute())
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_sums_are_not_written_into_memory_that_processes_share(kind: type[Metric]) -> None:
+    """What is sent to a spawned process lies in such memory, the same for all of them."""
+    truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None]
+    metric = kind()
+    sent = {name: state for name, state in metric.metric_state.items() if isinstance(state, torch.Tensor)}
+    before = {name: state.clone() for name, state in sent.items()}
+    metric.update(truth[None] + 0.1, truth)
+    assert all(torch.equal(state, before[name]) for name, state in sent.items())
 
 
 @pytest.mark.parametrize("kind", MADE)
