@@ -75,7 +75,8 @@ class Partner:
     ) -> None:
         denoiser = denoiser_of(denoiser)
         require_rate(past, "past")
-        past = past.detached()
+        # A copy, because the caller may write over it.
+        past = past.replace(**{name: value.detach().clone() for name, value in past.tensors().items()})
         check_request(denoiser, past, 0, 0, 1)
         if past.frames < TOKEN_FRAMES:
             raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")

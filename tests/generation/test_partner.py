@@ -301,9 +301,13 @@ def test_somebody_given_who_jumps_is_refused_and_the_partner_goes_on(model, duet
 
 def test_frames_that_were_answered_may_be_written_over(model, duet):
     """A buffer that is filled again and again, as live input is: nothing is refused, and answers are the same."""
+    past = duet.slice(0, 16)
+    past = past.replace(**{name: value.clone() for name, value in past.tensors().items()})
     partner, undisturbed = (
-        Partner(model, duet.slice(0, 16), (0,), FAST, torch.Generator().manual_seed(1)) for _ in range(2)
+        Partner(model, begun, (0,), FAST, torch.Generator().manual_seed(1)) for begun in (past, duet.slice(0, 16))
     )
+    for name in ("T_world_root", "betas"):
+        getattr(past, name).add_(1.0)
     buffer = duet.T_world_root[:, 16:20].clone()
     partner.answer(duet.slice(16, 20).replace(T_world_root=buffer))
     undisturbed.answer(duet.slice(16, 20))

@@ -90,6 +90,17 @@ def test_late_missing_and_doubled_poses_change_no_clock() -> None:
     assert (xs(ours)[:least] - xs(whole)[:least]).abs().max() < 1e-3
 
 
+def test_a_pose_may_be_written_over_by_the_next() -> None:
+    times = [n / 50 for n in range(51)]
+    expected, _ = fed(times)
+    live, pose, got = LiveFrames(), moving(0.0), []
+    for at in times:
+        for name, value in moving(at).tensors().items():
+            getattr(pose, name).copy_(value)
+        got.append(live.add(pose, at))
+    assert torch.equal(xs(cat_time([part for part in got if part is not None])), xs(expected))
+
+
 def test_poses_that_are_not_finite_or_not_valid_count_as_missing() -> None:
     live = LiveFrames()
     live.add(moving(0.0), 0.0)
