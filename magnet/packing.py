@@ -116,13 +116,13 @@ def version_of(weight: Tensor) -> float:
     return float(weight.sum(dtype=torch.float64)) if weight.is_inference() else weight._version
 
 
-_SUMS: weakref.WeakKeyDictionary[nn.Module, list[tuple[int, float]]] = weakref.WeakKeyDictionary()
-"""Of each weight of a model, how often it was written to and its sum, when it last was asked to sample."""
+_SUMS: weakref.WeakKeyDictionary[nn.Module, list[tuple[int, int, float]]] = weakref.WeakKeyDictionary()
+"""Of each weight of a model, which it is, how often it was written to and its sum, when it last was asked to sample."""
 
 
 @torch.no_grad()
 def count_unseen_writes(model: nn.Module) -> None:
-    """Count writes into `.data`, which torch does not count, so that what was made of such weights is made anew.
+    """Count writes into `.data`, and weights put in the place of others: what was made of them is made anew.
 
     For once a call: all weights are added up, which takes a millisecond for ten million. Shards are left alone.
     """
@@ -130,10 +130,9 @@ def count_unseen_writes(model: nn.Module) -> None:
     if not weights or weights[0].is_meta:
         return
     sums = torch.stack([each.sum(dtype=torch.float32) for each in weights]).tolist()
-    versions = [each._version for each in weights]
     before = _SUMS.get(model, [])
-    if len(before) == len(weights):
-        for each, now, version, (old_version, old) in zip(weights, sums, versions, before, strict=True):
-            if now != old and version == old_version:
-                torch.autograd.graph.increment_version(each)
-    _SUMS[model] = [(each._version, now) for each, now in zip(weights, sums, strict=True)]
+    others = [number for number, _, _ in before] != [id(each) for each in weights]
+    for each, now, (_, version, old) in zip(weights, sums, before, strict=False):
+        if others or (now != old and each._version == version):
+            torch.autograd.graph.increment_version(each)
+    _SUMS[model] = [(id(each), each._version, now) for each, now in zip(weights, sums, strict=True)]

@@ -99,6 +99,15 @@ def is_sharded(module: nn.Module) -> bool:
     return fsdp is not None and isinstance(module, (fsdp.FSDPModule, fsdp.FullyShardedDataParallel))
 
 
+def is_plain(module: nn.Module) -> bool:
+    """Whether it is made of our own layers alone: adapters in their place, and hooks, have no lean form."""
+    layers = (nn.ModuleList, nn.Sequential, nn.Linear, nn.LayerNorm, nn.GELU, nn.Dropout)
+    plain = {Transformer, TransformerBlock, *layers}
+    return all(
+        type(each) in plain and not each._forward_hooks and not each._forward_pre_hooks for each in module.modules()
+    )
+
+
 class TransformerBlock(nn.Module):
     """Post-norm transformer encoder block: self-attention over all tokens of a scene, then a GELU MLP."""
 

@@ -15,7 +15,7 @@ from magnet.denoiser.compiled import answered
 from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.lean import LeanTransformer, Memory, lean
 from magnet.denoiser.options import Sampling
-from magnet.denoiser.transformer import without_dropout
+from magnet.denoiser.transformer import is_plain, without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import finalize_bodies, shown
 from magnet.generation.conditioning import (
@@ -166,6 +166,7 @@ class Rollout:
     ) -> None:
         check_request(model, scene, context, frames, samples, task)
         count_unseen_writes(model)
+        self._plain = is_plain(model.transformer)
         layout = model.layout
         self.model, self.options, self.chunk = model, (options or SamplerOptions()).filled(model.sampling), chunk
         self.scene = scene.replace(given=None).to_float32().to(model.device).pad_agents(layout.agents)
@@ -305,7 +306,7 @@ class Rollout:
         """What predicts: the transformer as it was trained, or its lean form, which predicts only what is read."""
         network, precision = self.model.transformer, self.options.precision
         smooth = self.options.guidance.smooth  # by a gradient, which packed weights have not
-        if precision == "reference" or smooth or dtype_of(network) != torch.float32:
+        if precision == "reference" or smooth or not self._plain or dtype_of(network) != torch.float32:
             return network
         asked = self._asked if self.model.posterior is None else None
         packed = self._packed = self._packed or lean(network, precision)  # a stage looks once whether weights changed

@@ -5,21 +5,25 @@ from __future__ import annotations
 import gc
 import itertools
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from magnet.denoiser.lean import LeanTransformer, Memory, Precision, lean
 from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
+from magnet.generation.rollout import generate
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.planned_stage import run_planned_stage
 from magnet.sampling.schedule import Grid
 from magnet.sampling.solvers import History
 from magnet.tasks import registry
+from magnet.testing import random_scene, tiny_denoiser
 from tests.cases import some_slow
 
 SMALL = {"width": 32, "layers": 3, "heads": 2, "dropout": 0.0}
@@ -259,3 +263,39 @@ def test_inside_a_stage_nothing_waits_for_the_device(task: str, solver: str, mon
     monkeypatch.setattr("magnet.denoiser.transformer.FEW_SLOTS", 2)
     with pytest.raises((NotImplementedError, RuntimeError)):  # in groups it does
         net(*asked)
+
+
+def louder(layer: nn.Linear) -> nn.Module:
+    layer.weight = nn.Parameter(1.5 * layer.weight.detach())
+    return layer
+
+
+def hooked(layer: nn.Linear) -> nn.Module:
+    layer.register_forward_hook(lambda layer, given, made: 1.5 * made)
+    return layer
+
+
+class Adapter(nn.Module):
+    """Beside a layer, as adapters are trained; it shows the layer's own weights."""
+
+    def __init__(self, layer: nn.Linear) -> None:
+        super().__init__()
+        self.layer, self.weight, self.bias = layer, layer.weight, layer.bias
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 1.5 * self.layer(x)
+
+
+@pytest.mark.parametrize("change", [louder, hooked, Adapter])
+def test_a_network_that_was_changed_by_hand_is_sampled_as_it_is(change: Callable[[nn.Linear], nn.Module]) -> None:
+    """It was sampled before, and packed then."""
+    changed, duet = tiny_denoiser(max_agents=2), random_scene(1, 16, 2, torch.Generator().manual_seed(0))
+
+    def sampled(precision: Any) -> Tensor:
+        options, generator = SamplerOptions(2, requantize=False, precision=precision), torch.Generator().manual_seed(0)
+        return generate(changed, duet, registry.get("joint_future")(), 16, 16, 1, options, generator).T_world_root
+
+    before = sampled("float32")
+    changed.transformer.blocks[1].qkv = change(changed.transformer.blocks[1].qkv)
+    assert not torch.allclose(sampled("float32"), before, atol=1e-3)
+    torch.testing.assert_close(sampled("float32"), sampled("reference"), rtol=1e-4, atol=1e-4)
