@@ -26,6 +26,7 @@ from magnet.seeding import derive, step_generator
 from magnet.training import origins
 from magnet.training.optim import warmup_cosine
 from magnet.training.validation import log_means, of_one_size, places_of
+from magnet.waiting import may_look
 
 
 class Denoiser(DenoiserCore, TokenModel):
@@ -166,7 +167,12 @@ class Denoiser(DenoiserCore, TokenModel):
 
         made (B, N) bool: token steps that the model has made itself; they are shown clean and do not count. ramp:
         share of the consistency loss that counts; None: as far as training has come.
+
+        Raises:
+            ValueError: nobody has set how tokens are normalized (on a CPU; a GPU would be waited for).
         """
+        if may_look(self.device):
+            self.require_statistics()
         layout, weight = self.layout, self.loss
         with torch.no_grad():
             tokens, there = self.tokenize(scene)

@@ -105,6 +105,13 @@ class TokenModelCore(nn.Module):
                 "on from the shipped model: --model.start_from duet"
             )
 
+    def require_statistics(self) -> None:
+        if not self.normalizer.ready:
+            raise ValueError(
+                "the denoiser is not trained: it does not know how tokens are normalized; load a checkpoint, give "
+                "Trainer.fit a data module, or take it from scenes, model.fit_normalizer(*model.tokenize(scenes))"
+            )
+
     def train(self, mode: bool = True) -> Self:
         super().train(mode)
         if self.built:
@@ -197,7 +204,7 @@ class TokenModelCore(nn.Module):
         """
         scene = scene.pad_agents(self.layout.agents)
         latent = self._encoded(scene)
-        with torch.autocast(self.device.type, enabled=False):  # half precision would blur the transforms
+        with torch.autocast(scene.device.type, enabled=False):  # half precision would blur the transforms
             tokens = self.layout.pack(latent, *scene_transforms(scene))
         there = self.layout.group_present(scene.present)[:, None].expand(*tokens.shape[:3], -1)
         if scene.valid is not None:

@@ -57,8 +57,10 @@ class TokenModel(TokenModelCore, L.LightningModule):
     @torch.no_grad()
     def _fit_statistics(self) -> None:
         """z-scores from the first training batches; the same on every rank, because ranks draw alike here."""
-        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-        scenes = [scene.to(self.device) for scene in datamodule.statistics_batches()]
+        data: Any = getattr(self.trainer, "datamodule", None)
+        if not hasattr(data, "statistics_batches"):
+            self.require_statistics()
+        scenes = [scene.to(self.device) for scene in data.statistics_batches()]
         if not isinstance(self.tokenizer, TokenizerCore):  # a `Tokenizer` has been trained
             self.tokenizer.fit_normalizers(scenes)
         parts = [self.tokenize(scene) for scene in scenes]

@@ -41,8 +41,7 @@ def check_request(
     if isinstance(task, type) or not (task is None or hasattr(task, "schedule")):
         raise ValueError(f'task: got {task!r}, expected a task, such as magnet.tasks.registry.get("joint_future")()')
     model.require_tokenizer()
-    if not model.normalizer.ready:
-        raise ValueError("the denoiser is not trained: its normalizer is not fitted; load a checkpoint")
+    model.require_statistics()
     require_whole("context", context, 0)
     if context % TOKEN_FRAMES:
         raise ValueError(

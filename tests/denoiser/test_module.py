@@ -1,3 +1,4 @@
+import copy
 from pathlib import Path
 
 import lightning as L
@@ -110,6 +111,28 @@ def test_a_checkpoint_is_all_a_user_needs(tmp_path):
 def test_without_a_tokenizer_the_error_says_what_to_do(tmp_path):
     with pytest.raises(ValueError, match=r"has no tokenizer: --model\.tokenizer is 'absent\.ckpt'"):
         fitted(Denoiser("absent.ckpt", max_agents=3, window=8, **SIZES), 1)
+
+
+def test_without_a_data_module_somebody_has_to_say_how_tokens_are_normalized(tmp_path):
+    model, scenes = build(tmp_path), list(data().statistics_batches(2))
+    loader = torch.utils.data.DataLoader(scenes, batch_size=None)
+    with pytest.raises(ValueError, match=r"give Trainer\.fit a data module, or .* model\.fit_normalizer"):
+        model.losses(scenes[0], torch.Generator())
+    with pytest.raises(ValueError, match=r"give Trainer\.fit a data module"):
+        trainer(1).fit(model, loader)
+    model.fit_normalizer(*model.tokenize(scenes[0]))
+    before = copy.deepcopy(model)
+    trainer(1).fit(model, loader, loader)
+    assert not same_weights(model, before)
+
+
+def test_a_batch_can_be_tokenized_in_compiled_code(tmp_path):
+    """Lightning's own `device` cannot be."""
+    model, scene = build(tmp_path), next(data().statistics_batches(1))
+    tokens, there = torch.compile(model.tokenize, backend="eager")(scene)
+    expected, counts = model.tokenize(scene)
+    torch.testing.assert_close(tokens, expected)
+    assert torch.equal(there, counts)
 
 
 def test_statistics_make_training_tokens_standard(tmp_path):
