@@ -328,6 +328,10 @@ class MotionDataModule(LightningDataModule):
             return batch.to(device)
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the loader of a training, which is no part of a copy, nor of what is sent to a spawned process."""
+        return {**self.__dict__, "_train_loader": None, "_trained_by": None}
+
     def teardown(self, stage: str) -> None:
         """End the threads that read ahead; the next batch starts new ones."""
         self._close()

@@ -1,5 +1,8 @@
 """Laws of the common data room: what a batch shows, and what is refused."""
 
+import copy
+import itertools
+import pickle
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -25,6 +28,15 @@ def shown(name: str) -> tuple[str, int, int]:
     match = re.fullmatch(r"(.+) \[(\d+):(\d+)]", name)
     assert match, name
     return match[1], int(match[2]), int(match[3])
+
+
+def test_a_copy_begins_anew_and_may_be_sent_to_another_process() -> None:
+    """The training that goes on is the original's."""
+    data = FakeData(couples_and_singles(), max_agents=3, **PLAIN)
+    first, second = itertools.islice(loader := data.train_dataloader(), 2)
+    for other in (copy.deepcopy(data), pickle.loads(pickle.dumps(data))):
+        assert same(next(iter(other.train_dataloader())), first)
+    assert not same(next(iter(loader)), first) and not same(second, first)
 
 
 # -- what a window shows -----------------------------------------------------------------------
