@@ -8,7 +8,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -106,7 +106,7 @@ class Scene:
         """The tensor fields that are set, by name."""
         return {f: value for f in TENSORS if (value := getattr(self, f)) is not None}
 
-    def replace(self, **changes: object) -> Scene:
+    def replace(self, **changes: object) -> Self:
         """The scene with other fields.
 
         `given` is forgotten, unless named, where the number of scenes, frames or agents changes.
@@ -116,21 +116,21 @@ class Scene:
             changes.setdefault("given", None)
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
-    def to(self, device: torch.device | str | int) -> Scene:
+    def to(self, device: torch.device | str | int) -> Self:
         """The same scene on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
 
-    def to_float32(self) -> Scene:
+    def to_float32(self) -> Self:
         """The same scene in float32, as models take it."""
         floats = {name: value.float() for name, value in self.tensors().items() if value.dtype != torch.bool}
         return self if all(value is getattr(self, name) for name, value in floats.items()) else self.replace(**floats)
 
-    def detached(self) -> Scene:
+    def detached(self) -> Self:
         """The same scene, of which no gradient is taken."""
         floats = {name: value.detach() for name, value in self.tensors().items() if value.requires_grad}
         return self.replace(**floats) if floats else self
 
-    def slice(self, start: int, stop: int | None = None) -> Scene:
+    def slice(self, start: int, stop: int | None = None) -> Self:
         """Frames `start:stop` of every scene; negative ones count from the scene's end, and there may be none.
 
         Raises:
@@ -142,7 +142,7 @@ class Scene:
             raise ValueError(f"slice({start}, {stop}) of {self.frames} frames: the stop lies before the start")
         return self.frames_at(part)
 
-    def select(self, scenes: Tensor | Sequence[int] | builtins.slice) -> Scene:
+    def select(self, scenes: Tensor | Sequence[int] | builtins.slice) -> Self:
         """Some of the B scenes, in the order given."""
         if not isinstance(scenes, builtins.slice):
             empty = not isinstance(scenes, Tensor) and not len(scenes)
@@ -155,11 +155,11 @@ class Scene:
         chosen = torch.arange(self.scenes, device=self.device)[scenes].tolist()
         return self.replace(**changes, names=tuple(self.names[i] for i in chosen))
 
-    def repeat(self, samples: int) -> Scene:
+    def repeat(self, samples: int) -> Self:
         """Each scene `samples` times in a row: scene b becomes b * samples ... b * samples + samples - 1."""
         return self.select(torch.arange(self.scenes, device=self.device).repeat_interleave(samples))
 
-    def permute_agents(self, agents: Tensor) -> Scene:
+    def permute_agents(self, agents: Tensor) -> Self:
         """Agents in another order, one for all scenes. agents: (P,) int"""
         return self.replace(
             body_rot=self.body_rot[:, :, agents],
@@ -169,7 +169,7 @@ class Scene:
             given=None if self.given is None else self.given[:, :, agents],
         )
 
-    def people(self) -> Scene:
+    def people(self) -> Self:
         """Each person present as a scene of its own, (M, T, 1), in the order of scenes and slots; names are dropped."""
         there = self.present
         return self.replace(
@@ -182,17 +182,17 @@ class Scene:
             given=None if self.given is None else self.given.transpose(1, 2)[there].unsqueeze(2),
         )
 
-    def pad_frames(self, frames: int) -> Scene:
+    def pad_frames(self, frames: int) -> Self:
         """The scene with its first and last frame repeated so many times, before and after it."""
         T = self.frames
         return self.frames_at(torch.arange(-frames, T + frames, device=self.device).clamp(0, T - 1))
 
-    def frames_at(self, frames: builtins.slice | Tensor) -> Scene:
+    def frames_at(self, frames: builtins.slice | Tensor) -> Self:
         """Some of the frames, in the order given. frames (F,) int, or a slice"""
         timed = ("body_rot", "T_world_root", "valid", "given")
         return self.replace(**{name: value[:, frames] for name, value in self.tensors().items() if name in timed})
 
-    def pad_agents(self, agents: int) -> Scene:
+    def pad_agents(self, agents: int) -> Self:
         """The same people in `agents` slots; the new slots are absent.
 
         Raises:
@@ -206,14 +206,14 @@ class Scene:
             return self
         empty = empty_scene(self.scenes, self.frames, extra, self.T_world_root)
         given = None if self.given is None else torch.nn.functional.pad(self.given, (0, extra))
-        return cat_agents([self, empty]).replace(given=given)
+        return self.replace(**{**cat_agents([self, empty]).tensors(), "given": given})
 
-    def transformed(self, T_new_world: Tensor) -> Scene:
+    def transformed(self, T_new_world: Tensor) -> Self:
         """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
         keep = self.present[:, None, :, None, None]
         return self.replace(T_world_root=torch.where(keep, T_new_world @ self.T_world_root, self.T_world_root))
 
-    def with_poses(self, where: Tensor, body_rot: Tensor, T_world_root: Tensor) -> Scene:
+    def with_poses(self, where: Tensor, body_rot: Tensor, T_world_root: Tensor) -> Self:
         """The same with other poses in some places. where: (B, T, P) bool, or what broadcasts to it"""
         where = where[..., None, None]
         return self.replace(

@@ -13,9 +13,11 @@ if TYPE_CHECKING:
 __all__ = ["Quantized", "RawPose", "ResidualVQ", "Tokenizer"]
 
 
-def __getattr__(name: str) -> Any:
-    if name != "Tokenizer":
-        raise AttributeError(f"module 'magnet.tokenizer' has no attribute {name!r}; it has {', '.join(__all__)}")
-    from magnet.tokenizer.module import Tokenizer  # its training needs Lightning, its use does not
+if not TYPE_CHECKING:  # else type checkers would take any name for one of ours
 
-    return Tokenizer
+    def __getattr__(name: str) -> Any:
+        if name != "Tokenizer":
+            raise AttributeError(f"module 'magnet.tokenizer' has no attribute {name!r}; it has {', '.join(__all__)}")
+        from magnet.tokenizer.module import Tokenizer  # its training needs Lightning, its use does not
+
+        return Tokenizer
