@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 from magnet.body import load_body
-from magnet.export.page.rig import VIEWS, Style
+from magnet.export.drawing import STYLES, Style
 from magnet.export.page.takes import take
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -116,7 +116,7 @@ def main() -> None:
     options.add_argument("--frames", type=int, default=20_000)
     options.add_argument("--seconds", type=float, default=12.0)
     options.add_argument("--size", default="1280x720", help="of the window (default: %(default)s)")
-    options.add_argument("--views", nargs="+", choices=VIEWS, default=VIEWS)
+    options.add_argument("--views", nargs="+", choices=STYLES, default=STYLES)
     options.add_argument("--shadows", action="store_true", help="true shadows instead of discs")
     options.add_argument("--marks", action="store_true", help="trails, contacts and collisions too")
     options.add_argument("--dpr", type=float, help="viser's ?fixedDpr: 0.5 draws a quarter of the pixels")

@@ -11,14 +11,11 @@ from magnet.export.video import render_video
 from magnet.motion.resample import resampled
 from magnet.motion.tracked import LiveFrames, bridged
 
-load_bvh = load_rigs  # its name while it read nothing else
-
 __all__ = [
     "Camera",
     "LiveFrames",
     "bridged",
     "contact_sheet",
-    "load_bvh",
     "load_rigs",
     "load_smplx",
     "render_video",

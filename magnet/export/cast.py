@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
-from magnet.export.drawing import AGENTS, CONTEXT, Array, Canvas
+from magnet.export.drawing import AGENTS, CONTEXT, STYLES, Array, Canvas, Style, drawable
 from magnet.export.figures import add_capsules, add_mesh, add_sticks
 from magnet.export.page.light import Light, light
 from magnet.motion.scene import Scene
@@ -19,8 +18,6 @@ from magnet.motion.scene import Scene
 Scenes = Scene | list[tuple[str, Scene]] | dict[str, Scene]
 """A scene, each of its B a panel, or labelled scenes."""
 
-Style = Literal["skeleton", "capsules", "light", "body"]
-STYLES: tuple[Style, ...] = ("skeleton", "capsules", "light", "body")
 LIGHT = 800
 """Vertices of a light body in pictures, of 13,492; each triangle is split into four, so that it looks round."""
 
@@ -141,6 +138,18 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
     if len(rates) > 1:
         raise ValueError(f"got scenes of {rates} frames a second, expected one rate: magnet.export.resampled")
     return pairs
+
+
+def casts(scenes: Scenes, context_frames: int, body: Body | None, style: Style) -> tuple[list[str], list[Cast]]:
+    """Labels in characters that pictures have, and scenes ready for drawing; of the packaged body if none is given.
+
+    Raises:
+        ValueError: as `panels`, `cast` and `known_frames`.
+    """
+    labelled = panels(scenes)
+    body = body or default_body(labelled[0][1])
+    people = [cast(scene, body, style, known_frames(scene, context_frames)) for _, scene in labelled]
+    return [drawable(label) for label, _ in labelled], people
 
 
 def known_frames(scene: Scene, context_frames: int) -> Tensor:

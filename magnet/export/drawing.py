@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import unicodedata
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,9 @@ Array = NDArray[np.floating]
 Size = tuple[int, int]
 Colour = tuple[int, int, int]
 
-
+Style = Literal["body", "light", "capsules", "skeleton"]
+STYLES: tuple[Style, ...] = get_args(Style)
+"""Looks of people; `light` is the body with a twentieth of its vertices."""
 SMALLEST = 16
 """Pixels of a film's panel, at least."""
 

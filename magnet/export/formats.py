@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from magnet.body import Body, load_body
 from magnet.checks import require_number
 from magnet.errors import warn_user
 from magnet.export.bones import BoneOptions
 from magnet.export.bvh import Unit, paths_of, person_file, save_bvh
-from magnet.export.cast import Style
-from magnet.export.drawing import Size, require_size
+from magnet.export.drawing import Size, Style, require_size
 from magnet.export.fbx import blender, save_fbx
 from magnet.export.glb import save_glb
 from magnet.export.joints_csv import save_csv
 from magnet.export.npz import each_of, save_smplx
 from magnet.export.onto_rig import RigOptions, save_onto
+from magnet.export.page.html import save_html
+from magnet.export.picture import contact_sheet
 from magnet.export.usd import require_usd, save_usd
+from magnet.export.video import PICTURES, Report, render_video, require_av
 from magnet.export.vrma import save_vrma
 from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene, require_rotations
 
-if TYPE_CHECKING:
-    from magnet.export.video import Report
-
-PICTURES = (".mp4", ".gif", ".webp")
 USD = (".usdc", ".usda", ".usdz")
 FILM = (640, 480)
 """Pixels of a film's panel."""
@@ -80,53 +77,33 @@ class Format:
     ready: Callable[[], object] = lambda: None
 
 
-def _write_npz(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    return save_smplx(scene, path, o.body, apart=o.each) if o.smplx else [scene.save(path)]
-
-
 def _write_page(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    from magnet.export.page.html import save_html
-
     # A body's skin is only written where the page itself thinks it may be.
     styles: Any = None if o.style == "body" else (o.style,)
     return [save_html(scene, path, o.body, context=o.context_frames, title=o.title or "", styles=styles)]
 
 
-def _write_usd(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    return [save_usd(scene, path, o.body, o.bones)]
-
-
 def _write_film(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    from magnet.export.video import render_video
-
     return [render_video(scene, path, fps=o.fps, size=o.size, progress=o.progress, **o.look)]
 
 
-def _ready_for_mp4() -> None:
-    from magnet.export.video import require_av
-
-    require_av()
-
-
-def _write_strip(scene: Scene, path: Path, o: WriteOptions) -> Sequence[Path]:
-    from magnet.export.picture import contact_sheet
-
-    return [contact_sheet(scene, path, **o.look)]
-
-
 WRITTEN: dict[str, Format] = {
-    ".npz": Format(_write_npz, batch=True, nan=True),  # the scene itself; with smplx, SMPL-X's conventional keys
+    ".npz": Format(  # the scene itself; with smplx, SMPL-X's conventional keys
+        lambda all, to, o: save_smplx(all, to, o.body, apart=o.each) if o.smplx else [all.save(to)],
+        batch=True,
+        nan=True,
+    ),
     # A skeleton a person, one file each.
     ".bvh": Format(lambda one, to, o: save_bvh(one, to, o.body, unit=o.unit, names=o.bones.names)),
     ".glb": Format(lambda one, to, o: [save_glb(one, to, o.body, o.bones)]),  # everybody skinned and animated
     ".vrma": Format(lambda one, to, o: save_vrma(one, to, o.body)),  # for VRM avatars, a file a person
     ".fbx": Format(lambda one, to, o: [save_fbx(one, to, o.body, o.bones)], ready=blender),  # the same, by Blender
-    **{suffix: Format(_write_usd, ready=require_usd) for suffix in USD},
+    **dict.fromkeys(USD, Format(lambda one, to, o: [save_usd(one, to, o.body, o.bones)], ready=require_usd)),
     ".csv": Format(lambda all, to, o: [save_csv(all, to, o.body)], batch=True),  # a table of joint positions
     ".html": Format(_write_page, batch=True),  # a page that plays the scene, by itself
-    **{suffix: Format(_write_film, batch=True, own_rate=True) for suffix in PICTURES},
-    ".mp4": Format(_write_film, batch=True, own_rate=True, ready=_ready_for_mp4),
-    ".png": Format(_write_strip, batch=True, own_rate=True),  # a strip of moments
+    **dict.fromkeys(PICTURES, Format(_write_film, batch=True, own_rate=True)),
+    ".mp4": Format(_write_film, batch=True, own_rate=True, ready=require_av),
+    ".png": Format(lambda all, to, o: [contact_sheet(all, to, **o.look)], batch=True, own_rate=True),  # of moments
 }
 """Suffixes that can be written, and how."""
 
@@ -193,18 +170,17 @@ def write(
     """
     if not isinstance(title, str | None):
         raise ValueError(f"title: got {title!r}, expected text")
-    path = Path(path)
-    suffix = path.suffix.lower()
+    path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in WRITTEN:
         raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(WRITTEN)}")
     require_frames(scene)
-    kind, apart = WRITTEN[suffix], suffix == ".npz" and smplx
+    kind = WRITTEN[suffix]
     body = body or load_body("open")
     if scene.body != body.id:
         raise ValueError(f"the scene's shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body")
     if fps is not None:
         require_number("fps", fps, over=0, most=MOST_FPS)
-    if apart or not kind.nan:
+    if smplx or not kind.nan:
         require_finite(scene)
         _warn_of_invalid(scene, path)
     rate = scene.fps if fps is None else fps
@@ -213,10 +189,11 @@ def write(
         scene = resampled(scene, rate)
     options = WriteOptions(body, rate, unit, smplx, context_frames, style, title, progress, bones, size, each)
     places = places_of(path, scene.scenes, smplx)
-    make = functools.partial(_write_onto, rigs, RigOptions(joints=rig_joints)) if rigs else kind.write
-    if len(places) == 1:
-        return list(make(scene, path, options))
-    return [made for b, place in enumerate(places) for made in make(scene.select([b]), place, options)]
+    scenes = [scene] if len(places) == 1 else [scene.select([b]) for b in range(scene.scenes)]
+    pairs = zip(scenes, places, strict=True)
+    if rigs:
+        return [made for one, to in pairs for made in save_onto(one, to, body, rigs, RigOptions(joints=rig_joints))]
+    return [made for one, to in pairs for made in kind.write(one, to, options)]
 
 
 def _warn_of_invalid(scene: Scene, path: Path) -> None:
@@ -229,12 +206,6 @@ def _warn_of_invalid(scene: Scene, path: Path) -> None:
         f"{path.name}: {len(bad)} of {of}, {first}, are marked as not valid (somebody not tracked, or made up); such a "
         "file has no marks, and holds the scene's poses there like any motion; a .npz of the scene keeps them"
     )
-
-
-def _write_onto(
-    rigs: Sequence[str | Path], how: RigOptions, scene: Scene, path: Path, o: WriteOptions
-) -> Sequence[Path]:
-    return save_onto(scene, path, o.body, rigs, how)
 
 
 def places_of(path: Path, scenes: int, smplx: bool = False) -> list[Path]:

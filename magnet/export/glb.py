@@ -124,10 +124,10 @@ def _raised(vertices: Tensor) -> Tensor:
 
 
 class Gltf:
-    """A glTF document and its one binary buffer, grown part by part."""
+    """A glTF document and its one binary buffer, grown part by part; without arguments a new one."""
 
-    def __init__(self) -> None:
-        self.document: dict[str, Any] = {
+    def __init__(self, document: dict[str, Any] | None = None, binary: bytearray | None = None) -> None:
+        self.document: dict[str, Any] = document or {
             "asset": {"version": "2.0", "generator": f"magnet {__version__}"},
             "scene": 0,
             "scenes": [{"name": "scene", "nodes": []}],
@@ -139,10 +139,10 @@ class Gltf:
             "accessors": [],
             "bufferViews": [],
         }
-        self.binary = bytearray()
+        self.binary = bytearray() if binary is None else binary
 
     def add(self, kind: str, item: dict[str, Any]) -> int:
-        self.document[kind].append(item)
+        self.document.setdefault(kind, []).append(item)
         return len(self.document[kind]) - 1
 
     def accessor(
@@ -156,8 +156,9 @@ class Gltf:
     ) -> int:
         """Put numbers into the buffer. (N,) or (N, C) -> number of the accessor"""
         array = np.ascontiguousarray(array, dtype={FLOAT: "<f4", BYTE: "u1", SHORT: "<u2", INT: "<u4"}[component])
+        self.binary += bytes(-len(self.binary) % 4)
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": array.nbytes}
-        self.binary += array.tobytes() + bytes(-array.nbytes % 4)
+        self.binary += array.tobytes()
         item: dict[str, Any] = {
             "bufferView": self.add("bufferViews", view | ({"target": target} if target else {})),
             "componentType": component,
@@ -242,27 +243,25 @@ class Gltf:
     def animate(self, clip: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
         """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""
         quaternions = unbroken(to_quat(local.double()))
-        tracks = [("translation", first, self.accessor(place.numpy(), FLOAT, "VEC3"))]
+        self.track(clip, times, first, "translation", place)
         for j in range(local.shape[1]):
-            tracks.append(("rotation", first + j, self.accessor(quaternions[:, j].numpy(), FLOAT, "VEC4")))
-        for what, node, output in tracks:
-            clip["channels"].append({"sampler": len(clip["samplers"]), "target": {"node": node, "path": what}})
-            clip["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
+            self.track(clip, times, first + j, "rotation", quaternions[:, j])
+
+    def track(self, clip: dict[str, Any], times: int, node: int, what: str, values: Tensor) -> None:
+        """Keyframes of a node's translation (T, 3) or rotation (T, 4), x y z w."""
+        output = self.accessor(values.numpy(), FLOAT, "VEC4" if what == "rotation" else "VEC3")
+        clip["channels"].append({"sampler": len(clip["samplers"]), "target": {"node": node, "path": what}})
+        clip["samplers"].append({"input": times, "output": output, "interpolation": "LINEAR"})
 
     def packed(self) -> bytes:
-        """The file."""
-        return packed(self.document, self.binary)
-
-
-def packed(document: dict[str, Any], binary: bytearray) -> bytes:
-    """A document and its one buffer as a file: header, JSON padded with spaces, buffer padded with zeros."""
-    held = {key: value for key, value in document.items() if value != []}  # glTF has no empty lists
-    data = bytes(binary) + bytes(-len(binary) % 4)
-    text = json.dumps(held | {"buffers": [{"byteLength": len(data)}]}, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + len(data)
-    head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
-    return head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+        """The file: header, JSON padded with spaces, buffer padded with zeros."""
+        held = {key: value for key, value in self.document.items() if value != []}  # glTF has no empty lists
+        data = bytes(self.binary) + bytes(-len(self.binary) % 4)
+        text = json.dumps(held | {"buffers": [{"byteLength": len(data)}]}, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + len(data)
+        head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
+        return head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
 
 def unbroken(quaternions: Tensor) -> Tensor:

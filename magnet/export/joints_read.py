@@ -12,13 +12,13 @@ from torch import Tensor
 
 from magnet.body.base import MOST_SHAPE, Body
 from magnet.body.fit import BodyFit, fit_body
-from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, KNEES, L_ANKLE, L_FOOT, L_HIP, L_KNEE, NECK, SHOULDERS, TOES
+from magnet.body.joints import ANKLES, HIPS, JOINT_NAMES, KNEES, L_ANKLE, L_FOOT, L_HIP, L_KNEE, SHOULDERS, TOES
 from magnet.export.cutting import Begin, kept_frames
 from magnet.export.joints_table import SLOW, JointTable, read_table
 from magnet.export.naming import recognised
 from magnet.export.npz import require_own_rate
 from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
-from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP
+from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP, require_unit, require_up
 from magnet.export.rig_motion import Bools, Floats
 from magnet.export.upright import WARNING
 from magnet.motion.rotations import about_y
@@ -64,8 +64,7 @@ def load_joints(
     """
     path, table = Path(path), read_table(path)
     rate, doubts = _rate(path, table, fps)
-    if up is not None and up not in UP:
-        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
+    require_up(up)
     found, weight, scheme = _joints(path, table, joints)
     used = sorted(weight)
     kept = kept_frames(path, len(table.at), start, end)
@@ -145,8 +144,7 @@ def _joints(
             f"{path}: cannot tell which joint is {', '.join(naming.missing)}; it has {', '.join(table.names)}. "
             f"Name them: --joint {naming.missing[0]}=ITS_NAME (joints={{...}} in Python)"
         )
-    sided = {j: w for left, w in TARGETS.items() for j in ((left,) if left == NECK else (left, left + 1))}
-    return naming.joints, {j: w for j, w in sided.items() if j in naming.joints}, f"names of {naming.scheme}"
+    return naming.joints, {j: w for j, w in TARGETS.items() if j in naming.joints}, f"names of {naming.scheme}"
 
 
 def _fitted(
@@ -200,8 +198,7 @@ def _bridged(at: Floats, sure: Bools) -> Floats:
 
 def _unit(path: Path, at: Floats, used: Sequence[int], said: str | None) -> tuple[str, list[str]]:
     """The unit of length as it is said, else by the legs; and a warning where legs say otherwise. at (T, P, M, 3)"""
-    if said is not None and said not in UNITS:
-        raise ValueError(f"unit {said!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+    require_unit(said)
     hip, knee, ankle = (at[:, :, used.index(j)] for j in (L_HIP, L_KNEE, L_ANKLE))
     bones = np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
     leg = float(np.nanmedian(bones)) if np.isfinite(bones).any() else math.nan

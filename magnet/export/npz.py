@@ -13,7 +13,7 @@ from torch import Tensor
 
 from magnet.body import Body
 from magnet.export.bvh import person_file
-from magnet.export.rig import UNITS, UP
+from magnet.export.rig import UNITS, UP, require_unit, require_up
 from magnet.export.smpl_keys import (
     BODY,
     ORIENT,
@@ -182,8 +182,7 @@ def scene_of(
 
 
 def _scene_of(where: str | Path, read: _Held, body: Body, up: str | None, unit: str | None) -> tuple[Scene, str]:
-    if unit is not None and unit not in UNITS:
-        raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+    require_unit(unit)
     arrays, fps, written_for, name = read
     if written_for is not None and written_for != body.id:
         raise ValueError(f"{where}: written for body {written_for!r}, but {body.id!r} was given")
@@ -212,8 +211,7 @@ def _scene_of(where: str | Path, read: _Held, body: Body, up: str | None, unit: 
     T_world_root = rigid(turned[:, :, 0], pelvis)
     if up is None:
         up = "y" if written_for is not None else _standing(T_world_root)
-    if up not in UP:
-        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
+    require_up(up)
     T_world_root = T_world_root.new_tensor(np.block([[UP[up], np.zeros((3, 1))], [np.eye(4)[3:]]])) @ T_world_root
     if unit is None:
         _require_metres(where, T_world_root)

@@ -6,21 +6,21 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import ANKLES, COLLARS, HIPS, KNEES
 from magnet.export.bvh import bvh_text, depth_first, euler_zxy, paths_of
 from magnet.export.bvh_read import bvh_lines, read_bvh
 from magnet.export.fbx import as_fbx, converted
-from magnet.export.glb import FLOAT, animation, frame_times, packed, standing, unbroken
+from magnet.export.glb import FLOAT, Gltf, animation, frame_times, standing, unbroken
 from magnet.export.glb_read import GlbRig, in_one_line, read_rig
 from magnet.export.gltf_file import matrices
 from magnet.export.retarget import rests_aligned, sources
-from magnet.export.rig import UP, Skeleton, rest_frame, understood
+from magnet.export.rig import UP, Skeleton, rest_frame, understood_together
 from magnet.export.rig_motion import Floats, RigMotion
 from magnet.files import whole, write_text
 from magnet.motion.bvh import bvh_header
@@ -154,7 +154,7 @@ def _ankles(rest: Floats, stands: Floats, ours: Mapping[int, int], longer: float
 
 def _onto_bvh(scene: Scene, path: Path, body: Body, rig: Path, options: RigOptions) -> None:
     file = read_bvh(rig)
-    skeleton = understood(file, options.unit, options.up, options.joints)
+    (skeleton,) = understood_together([file], options.unit, options.up, options.joints)
     moved = moved_as(scene, body, skeleton)
     if moved.pelvis != 0:
         raise ValueError(f"{rig}: its root {file.names[0]} is not its pelvis; write a .glb, or take the hips as root")
@@ -192,7 +192,8 @@ def _tips(rig: Path) -> dict[int, Floats]:
 
 def _onto_glb(scene: Scene, path: Path, body: Body, rig: Path, options: RigOptions) -> None:
     character = read_rig(rig, options.joints)
-    skeleton = understood(character.rig, options.unit, options.up or character.rig.up, options.joints)
+    up = options.up or character.rig.up
+    (skeleton,) = understood_together([character.rig], options.unit, up, options.joints)
     moved = moved_as(scene, body, skeleton)
     with whole(path) as part:
         part.write_bytes(_animated(character, moved, scene.frames, scene.fps))
@@ -202,49 +203,28 @@ def _animated(character: GlbRig, moved: Moved, frames: int, fps: float) -> bytes
     """The character's file with one animation, in place of those that it had."""
     file, joints = character.file, character.joints
     with in_one_line(file.path):
-        document, binary = file.in_one()
-
-    def accessor(array: Any, kind: str, **more: Any) -> int:
-        data = np.ascontiguousarray(array, dtype="<f4")
-        binary.extend(bytes(-len(binary) % 4))
-        view = {"buffer": 0, "byteOffset": len(binary), "byteLength": data.nbytes}
-        binary.extend(data.tobytes())
-        document["bufferViews"].append(view)
-        item = {
-            "bufferView": len(document["bufferViews"]) - 1,
-            "componentType": FLOAT,
-            "count": len(data),
-            "type": kind,
-        }
-        document.setdefault("accessors", []).append(item | more)
-        return len(document["accessors"]) - 1
-
-    times = frame_times(frames, fps)
+        gltf = Gltf(*file.in_one())
     clip = animation("motion")
-    keys = accessor(times, "SCALAR", min=[float(times[0])], max=[float(times[-1])])
+    times = gltf.accessor(frame_times(frames, fps), FLOAT, "SCALAR", bounds=True)
 
-    def track(node: int, what: str, values: Any, kind: str) -> None:
-        said = document["nodes"][node]
-        if "matrix" in said:  # which a node that moves may not have
-            rest = file.resting(node)
-            del said["matrix"]
-            said |= {key: value.tolist() for key, value in rest.items()}
-        clip["channels"].append({"sampler": len(clip["samplers"]), "target": {"node": node, "path": what}})
-        clip["samplers"].append({"input": keys, "output": accessor(values, kind), "interpolation": "LINEAR"})
+    def track(node: int, what: str, values: Tensor) -> None:
+        said = gltf.document["nodes"][node]
+        if said.pop("matrix", None) is not None:  # which a node that moves may not have
+            said |= {key: value.tolist() for key, value in file.resting(node).items()}
+        gltf.track(clip, times, node, what, values)
 
     world = {joints[k]: turned @ character.turn[k] for k, turned in moved.turned.items()}
     for node in joints:
         if node in world:
             above = np.eye(3) if node not in file.parents else _turn_of(character, file.parents[node], world)
             local = np.swapaxes(above, -1, -2) @ world[node]
-            quaternions = unbroken(to_quat(torch.from_numpy(np.broadcast_to(local, (frames, 3, 3)).copy())))
-            track(node, "rotation", quaternions.numpy(), "VEC4")
+            track(node, "rotation", unbroken(to_quat(torch.from_numpy(np.broadcast_to(local, (frames, 3, 3)).copy()))))
     pelvis = joints[moved.pelvis]
     above = file.at_rest(file.parents[pelvis]) if pelvis in file.parents else np.eye(4)
     back = np.linalg.inv(above)
-    track(pelvis, "translation", moved.at @ back[:3, :3].T + back[:3, 3], "VEC3")
-    document["animations"] = [clip]
-    return packed(document, binary)
+    track(pelvis, "translation", torch.from_numpy(moved.at @ back[:3, :3].T + back[:3, 3]))
+    gltf.document["animations"] = [clip]
+    return gltf.packed()
 
 
 def _turn_of(character: GlbRig, node: int, world: Mapping[int, Floats]) -> Floats:

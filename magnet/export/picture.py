@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from magnet.body import Body
-from magnet.export.cast import Scenes, Style, cast, default_body, known_frames, panels
-from magnet.export.drawing import INK, Camera, Size, drawable, font, plan_views
+from magnet.export.cast import Scenes, casts
+from magnet.export.drawing import INK, Camera, Size, Style, drawable, font, plan_views
 from magnet.export.video import GENERATED, PAGE, PINK, paint
 from magnet.files import whole
 
@@ -45,18 +45,16 @@ def contact_sheet(
     Raises:
         ValueError: scenes that cannot be drawn, or a frame outside them.
     """
-    rows = [(drawable(label), scene) for label, scene in panels(scenes)]
-    first = rows[0][1]
-    body = body or default_body(first)
-    people = [cast(s, body, style, known_frames(s, context_frames)) for _, s in rows]
-    moments = np.linspace(0, first.frames - 1, columns).round().astype(int).tolist() if frames is None else list(frames)
-    if not moments or not all(0 <= moment < first.frames for moment in moments):
-        raise ValueError(f"frames {moments}: expected some of 0 to {first.frames - 1}")
-    views = plan_views([c.joints for c in people], camera or Camera(), cell, first.fps)
+    labels, people = casts(scenes, context_frames, body, style)
+    last, fps = people[0].frames - 1, people[0].scene.fps
+    moments = np.linspace(0, last, columns).round().astype(int).tolist() if frames is None else list(frames)
+    if not moments or not all(0 <= moment <= last for moment in moments):
+        raise ValueError(f"frames {moments}: expected some of 0 to {last}")
+    views = plan_views([c.joints for c in people], camera or Camera(), cell, fps)
     unit = cell[1] / 240
-    left = round(_label_width([label for label, _ in rows], 15 * unit))
+    left = round(_label_width(labels, 15 * unit))
     top = round((34 if title else 0) * unit) + round(26 * unit)
-    page = Image.new("RGB", (left + len(moments) * cell[0], top + len(rows) * cell[1]), PAGE)
+    page = Image.new("RGB", (left + len(moments) * cell[0], top + len(people) * cell[1]), PAGE)
     draw = ImageDraw.Draw(page)
     if title:
         draw.text((12 * unit, 22 * unit), drawable(title), fill=INK, font=font(20 * unit), anchor="lm")
@@ -64,11 +62,11 @@ def contact_sheet(
     for i, moment in enumerate(moments):
         ink = PINK if moment < context else GENERATED
         place = (left + (i + 0.5) * cell[0], top - 13 * unit)
-        seconds = f"{(moment - context + 1) / first.fps:+.2f} s" if context else f"{moment / first.fps:.2f} s"
+        seconds = f"{(moment - context + 1) / fps:+.2f} s" if context else f"{moment / fps:.2f} s"
         draw.text(place, seconds, fill=ink, font=font(15 * unit), anchor="mm")
         for row, group in enumerate(people):
             page.paste(paint(group, views[row][moment], moment), (left + i * cell[0], top + row * cell[1]))
-    for row, (label, _) in enumerate(rows):
+    for row, label in enumerate(labels):
         middle = top + (row + 0.5) * cell[1]
         draw.multiline_text((12 * unit, middle), _broken(label), fill=INK, font=font(15 * unit), anchor="lm")
         if row:

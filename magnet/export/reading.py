@@ -139,16 +139,15 @@ def read(
     people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = list(dict.fromkeys(note for one in people for note in one.notes))  # people of one file share some
-    if len(scenes) == 1:
+    if len(people) == 1:
         scene = scenes[0] if options.fps is None else resampled(scenes[0], options.fps)
-        notes += rates_note([scenes[0].fps], scene.fps)
-        return _grounded(scene, body, notes, () if options.keep_floor else foreign)
-    for one in people:
-        if one.scene.scenes != 1:
-            raise ValueError(
-                f"{one.where}: holds {one.scene.scenes} scenes; several files are several people of one scene"
-            )
-    scene = together(scenes, [one.where for one in people], fps=options.fps, trim=options.trim)
+    else:
+        for one in people:
+            if one.scene.scenes != 1:
+                raise ValueError(
+                    f"{one.where}: holds {one.scene.scenes} scenes; several files are several people of one scene"
+                )
+        scene = together(scenes, [one.where for one in people], fps=options.fps, trim=options.trim)
     notes += rates_note([one.fps for one in scenes], scene.fps)
     return _grounded(scene, body, notes, () if options.keep_floor else foreign)
 

@@ -23,7 +23,7 @@ from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock, together
-from magnet.export.rig import LIMBS, UNITS, UP, Skeleton, people_of, understood_together
+from magnet.export.rig import LIMBS, Skeleton, people_of, require_unit, require_up, understood_together
 from magnet.export.rig_files import read_rigs
 from magnet.export.rig_motion import RigMotion
 from magnet.motion.frames import rigid
@@ -31,11 +31,10 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 
 Floats = NDArray[np.float64]
 
-TARGETS = {
-    L_HIP: 1.0, L_KNEE: 1.0, L_ANKLE: 1.0, L_FOOT: 0.5, NECK: 0.1, L_SHOULDER: 1.0, L_ELBOW: 1.0, L_WRIST: 2.0,
-}  # fmt: skip
-"""Left joints (and the neck) that the body is fitted to, with weights. Spine, collars and head lie elsewhere in every
-rig: only their rotations are used."""
+SIDED = {L_HIP: 1.0, L_KNEE: 1.0, L_ANKLE: 1.0, L_FOOT: 0.5, L_SHOULDER: 1.0, L_ELBOW: 1.0, L_WRIST: 2.0}
+TARGETS = {NECK: 0.1} | {left + side: weight for left, weight in SIDED.items() for side in (0, 1)}
+"""Joints that the body is fitted to, with weights. Spine, collars and head lie elsewhere in every rig: only their
+rotations are used."""
 FARTHEST_SWING = math.radians(110.0)
 """Largest angle between a bone in our rest pose and in theirs; beyond it the bone's roll is ambiguous."""
 SAME_BODY = 0.002
@@ -147,10 +146,8 @@ def load_rigs(
     each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not each:
         raise ValueError("no files given")
-    if up is not None and up not in UP:
-        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
-    if unit is not None and unit not in UNITS:
-        raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+    require_up(up)
+    require_unit(unit)
     files = [rig for path in each for rig in people_of(read_rigs(path, start, end, clip), joints)]
     require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
@@ -278,8 +275,7 @@ def _source(
 
 def _fitted(skeleton: Skeleton, body: Body, refuse_above: float, most_shape: float | None) -> tuple[Scene, Source]:
     ours = skeleton.naming.joints
-    wanted = {j: w for left, w in TARGETS.items() for j in ((left,) if left == NECK else (left, left + 1))}
-    weights = {j: w for j, w in wanted.items() if j in ours}
+    weights = {j: w for j, w in TARGETS.items() if j in ours}
     joints = sorted(weights)
     targets = torch.from_numpy(skeleton.at[:, [ours[j] for j in joints]])[:, None]
     rotations, used = hints(skeleton, body.rest_joints(torch.zeros(10)).double())

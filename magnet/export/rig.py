@@ -51,9 +51,16 @@ class Skeleton:
     notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
 
 
-def understood(file: RigMotion, unit: str | None, up: str | None, given: Mapping[str, str] | None) -> Skeleton:
-    """As `understood_together`, one file."""
-    return understood_together([file], unit, up, given)[0]
+def require_unit(unit: str | None) -> None:
+    """Refuse a unit of length that is none of `UNITS`; None: it is to be found."""
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit {unit!r}: expected one of {', '.join(name for name in UNITS if ' ' not in name)}")
+
+
+def require_up(up: str | None) -> None:
+    """Refuse an axis that is none of `UP`; None: it is to be found."""
+    if up is not None and up not in UP:
+        raise ValueError(f"up axis {up!r}: expected one of {', '.join(UP)}")
 
 
 def understood_together(

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from magnet.body import Body
-from magnet.export.cast import Cast, Scenes, Style, cast, default_body, known_frames, panels
+from magnet.export.cast import Cast, Scenes, cast, casts
 from magnet.export.drawing import (
     CONTEXT,
     INK,
@@ -23,6 +23,7 @@ from magnet.export.drawing import (
     Camera,
     Canvas,
     Size,
+    Style,
     View,
     drawable,
     font,
@@ -36,7 +37,8 @@ from magnet.motion.scene import FPS, Scene
 Report = Callable[[int, int], None]
 """Told after each frame: frames done, frames in all."""
 
-SUFFIXES = (".mp4", ".gif", ".webp")
+PICTURES = (".mp4", ".gif", ".webp")
+"""Suffixes of films."""
 PINK = CONTEXT[0]
 GENERATED = (72, 84, 106)
 PAGE = (255, 255, 255)
@@ -83,8 +85,8 @@ def render_video(
         ImportError: .mp4 without PyAV.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{path.name}: cannot write a file with suffix {path.suffix!r}; use {', '.join(PICTURES)}")
     require_size(size)
     for name, value in (("fps", fps), ("speed", speed)):
         if not value > 0:
@@ -112,15 +114,11 @@ class Film:
         trail: float,
         speed: float = 1.0,
     ) -> None:
-        labelled = panels(scenes)
-        first = labelled[0][1]
-        body = body or default_body(first)
+        self.labels, self.casts = casts(scenes, context_frames, body, style)
         self.fps, self.size, self.trail, self.speed = fps, size, trail, speed
         self.title = None if title is None else drawable(title)
-        self.scene_fps = first.fps
-        self.labels = [drawable(label) for label, _ in labelled]
-        self.casts = [cast(s, body, style, known_frames(s, context_frames)) for _, s in labelled]
-        self.ghost = None if ghosts is None else cast(ghosts, body, "skeleton").joints
+        self.scene_fps = self.casts[0].scene.fps
+        self.ghost = None if ghosts is None else cast(ghosts, self.casts[0].body, "skeleton").joints
         if self.ghost is not None and len(self.ghost) != self.casts[0].frames:
             raise ValueError(f"ghosts have {len(self.ghost)} frames, the scenes {self.casts[0].frames}; cut them alike")
         groups = [c.joints for c in self.casts]
@@ -129,8 +127,8 @@ class Film:
         self.views = plan_views(groups, camera, size, self.scene_fps)
         duration = self.casts[0].frames / self.scene_fps
         self.frames = max(1, round(duration * fps / speed))
-        self.columns = len(labelled) if len(labelled) <= 3 else math.ceil(math.sqrt(len(labelled)))
-        self.rows = math.ceil(len(labelled) / self.columns)
+        self.columns = len(self.casts) if len(self.casts) <= 3 else math.ceil(math.sqrt(len(self.casts)))
+        self.rows = math.ceil(len(self.casts) / self.columns)
         self.header = 0 if title is None else round(0.08 * size[1] / 2) * 2
         self.context_end = self.casts[0].context
         self.size_all = (self.columns * size[0], self.rows * size[1] + self.header)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
-from magnet.export.page.rig import VIEWS, Array
+from magnet.export.drawing import STYLES, Array
 from magnet.files import file_word
 from magnet.motion.scene import FPS
 from magnet.viewer.clock import SPEEDS, Clock
@@ -131,7 +131,7 @@ class ViewerBase:
         """Controls of looks and camera. ghosts: whether there is a ground truth; None: no such control."""
         gui = self.server.gui
         with gui.add_folder("Look"):
-            style = gui.add_dropdown("people", VIEWS, initial_value=self.render.style)
+            style = gui.add_dropdown("people", STYLES, initial_value=self.render.style)
             shown = {"ghosts": gui.add_checkbox("ground truth", self.render.ghosts)} if ghosts else {}
             if ghosts is False:
                 hint = "magnet view FILE --truth RECORDED.npz shows it as ghosts"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from magnet.body.base import Body
-from magnet.export.page.rig import Array
+from magnet.export.drawing import Array
 from magnet.export.page.takes import take
 from magnet.generation.live import Live, LiveChunk
 from magnet.motion.scene import Scene

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from magnet.body.base import Body
+from magnet.export.drawing import Array, Style
 from magnet.export.limbs import CAPSULES, STICKS, Limb, limbs, turn_to
 from magnet.export.page.palette import Colours, for_batches
-from magnet.export.page.rig import Array, Rig, Style, capsule, rigs
+from magnet.export.page.rig import Rig, capsule, rigs
 from magnet.motion.rotations import to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene
 

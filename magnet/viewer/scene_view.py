@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from magnet.body.base import Body
+from magnet.export.drawing import Array, Style
 from magnet.export.page.palette import GHOST, agent_colours, pale
-from magnet.export.page.rig import Array, Style, bone_poses
+from magnet.export.page.rig import bone_poses
 from magnet.export.page.takes import ShownTake
 from magnet.motion.scene import Scene
 from magnet.viewer.people import PeopleView, add_people

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from magnet.body.joints import PELVIS, TOES
-from magnet.export.drawing import SHADOW
+from magnet.export.drawing import SHADOW, Array
 from magnet.export.page.marks import BALL, DISC, HAND, MOST, depth_colours, penetrations, standing, touching
 from magnet.export.page.palette import FLOOR, LINES, SLIDES, STANDS, TOUCHES, Colours, for_batches
-from magnet.export.page.rig import Array, Index, capsule
+from magnet.export.page.rig import Index, capsule
 
 AWAY, NO_SIZE = -50.0, 1e-6
 """Height in metres and size of unused marks, which keep them invisible."""

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.body.base import Body
+from magnet.export.drawing import Style
 from magnet.export.page.palette import agent_colours
-from magnet.export.page.rig import CROWD, Style, first_style
+from magnet.export.page.rig import CROWD, first_style
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, titled
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.tokens import TOKEN_FRAMES

@@ -12,8 +12,7 @@ from PIL import Image
 
 from magnet.body import Body
 from magnet.export import contact_sheet
-from magnet.export.cast import STYLES, Style
-from magnet.export.drawing import AGENTS, CONTEXT
+from magnet.export.drawing import AGENTS, CONTEXT, STYLES, Style
 from magnet.export.figures import bulged
 from magnet.motion.scene import Scene
 from tests.cases import few

@@ -13,8 +13,18 @@ from PIL import Image
 
 from magnet.body import Body
 from magnet.export import Camera, render_video
-from magnet.export.cast import STYLES, Style
-from magnet.export.drawing import AGENTS, CONTEXT, SMALLEST, Canvas, Size, plan_views, require_size, strokes
+from magnet.export.drawing import (
+    AGENTS,
+    CONTEXT,
+    SMALLEST,
+    STYLES,
+    Canvas,
+    Size,
+    Style,
+    plan_views,
+    require_size,
+    strokes,
+)
 from magnet.export.video import Film
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -196,7 +206,7 @@ def test_bad_input_is_named_and_leaves_no_file(duet: Scene, body: Body, tmp_path
         render(size=(161, 120))
     with pytest.raises(ValueError, match="fps: got 0, expected more than 0"):
         render(fps=0.0)
-    with pytest.raises(ValueError, match="expected one of skeleton"):
+    with pytest.raises(ValueError, match="expected one of body"):
         render(style="bones")
     with pytest.raises(ValueError, match="nobody is present"):
         render(duet.replace(present=torch.zeros(1, 2, dtype=torch.bool)))

@@ -14,7 +14,7 @@ from magnet.cli import main, view
 from magnet.cli.view import arguments_of, sampler_options
 from magnet.datamodules.fakes.body import write_body
 from magnet.export import save_bvh
-from magnet.export.page.rig import VIEWS
+from magnet.export.drawing import STYLES
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.testing import tiny_denoiser
@@ -164,7 +164,7 @@ def test_a_page_holds_all_files_and_samples(tmp_path: Path, duet: Scene) -> None
     assert '"takes":["a \\u00b7 1","a \\u00b7 2","b"]' in (tmp_path / "a.html").read_text()
 
 
-@pytest.mark.parametrize("style", some_slow(VIEWS, "light"))
+@pytest.mark.parametrize("style", some_slow(STYLES, "light"))
 def test_a_page_of_any_style_is_written_without_viser_or_a_server(
     tmp_path: Path, duet: Scene, monkeypatch, capsys, style
 ) -> None:

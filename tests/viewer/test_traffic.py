@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from magnet.body import Body
+from magnet.export.drawing import STYLES, Style
 from magnet.export.limbs import CAPSULES, STICKS
-from magnet.export.page.rig import VIEWS, Style
 from magnet.export.page.takes import take
 from magnet.motion.scene import BODY_JOINTS
 from magnet.testing import random_scene
@@ -46,7 +46,7 @@ def told(body: Body, people: int, frames: int, style: Style, rich: bool = False)
     return Counter(type(message).__name__ for message in heard), len(words) + sum(array.nbytes for array in arrays)
 
 
-@pytest.mark.parametrize("style", VIEWS)
+@pytest.mark.parametrize("style", STYLES)
 def test_a_frame_costs_two_messages_a_bone_or_two_a_limb_of_everybody(style: Style, body: Body) -> None:
     few, _ = told(body, 2, 24, style)
     many, size = told(body, 16, 24, style)

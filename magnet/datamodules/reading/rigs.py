@@ -24,7 +24,7 @@ from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import Scene
 
 Unit = Literal["m", "cm", "mm", "inch", "foot"]
-LIMBS = sorted({joint + side for joint in TARGETS if joint != NECK for side in (0, 1)})
+LIMBS = sorted(set(TARGETS) - {NECK})
 LIKELY_SHAPE = 5.0
 """Largest shape number: unusual proportions are left as a residual rather than fitted by an impossible body."""
 SHOWN = 12

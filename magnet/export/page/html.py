@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from magnet.body.base import Body
 from magnet.body.contact import DEEP, TOUCH
 from magnet.body.joints import PARENTS
+from magnet.export.drawing import STYLES, Style
 from magnet.export.page.marks import marked
 from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
-from magnet.export.page.rig import VIEWS, Rig, Style, bone_poses, first_style, rigs
+from magnet.export.page.rig import Rig, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes, titled
 from magnet.files import write_text
 from magnet.motion.scene import Scene
@@ -89,9 +90,9 @@ def page(
     if styles is None:
         skin = first_style(sum(len(each.slots) for each in shown))
         styles = ((skin,) if body.id.startswith("open") else ()) + ("capsules", "skeleton")
-    unknown = [style for style in styles if style not in VIEWS]
+    unknown = [style for style in styles if style not in STYLES]
     if unknown or not styles:
-        raise ValueError(f"styles {styles}: choose from {', '.join(VIEWS)}")
+        raise ValueError(f"styles {styles}: choose from {', '.join(STYLES)}")
     ghosts = None if truth is None else take("ground truth", truth.replace(given=None))
     meta, arrays = _contents(shown, body, ghosts, styles)
     data, meta["arrays"] = _packed(arrays)

@@ -14,8 +14,9 @@ from magnet.body.capsules import capsule_segments, nearest_points
 from magnet.body.contact import DEEP, STANDING, TOUCH, WITHIN, penetration_depth, toe_steps
 from magnet.body.energy import hand_points
 from magnet.body.joints import TOES
+from magnet.export.drawing import Array
 from magnet.export.page.palette import COLLIDES, SLIDES
-from magnet.export.page.rig import CROWD, Array, Index
+from magnet.export.page.rig import CROWD, Index
 from magnet.motion.scene import Scene
 
 Mask = NDArray[np.bool_]

@@ -7,7 +7,6 @@ R_j (x - rest_j) + t_j, and one that follows several to the mean of these places
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from magnet.body.base import Body
 from magnet.body.joints import PARENTS
+from magnet.export.drawing import Array, Style
 from magnet.export.limbs import (
     CAPSULES,
     CROWN,
@@ -34,11 +34,7 @@ from magnet.export.page.light import light
 from magnet.motion.rotations import from_quat, to_quat
 from magnet.motion.scene import BODY_JOINTS, Scene
 
-Array = NDArray[np.floating]
 Index = NDArray[np.integer]
-Style = Literal["body", "light", "capsules", "skeleton"]
-VIEWS: tuple[Style, ...] = ("body", "light", "capsules", "skeleton")
-"""All there are; `light` is the body with a twentieth of its vertices."""
 
 CROWD = 8
 """People in all above whom light bodies are the first choice."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magnet.export.page.rig import Array
+from magnet.export.drawing import Array
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 

@@ -6,8 +6,9 @@ import roma
 import torch
 
 from magnet.body import Body
+from magnet.export.drawing import STYLES
 from magnet.export.limbs import CAPSULES, STICKS, limbs, turn_to
-from magnet.export.page.rig import VIEWS, bend, bone_poses, capsule, rigs, strongest
+from magnet.export.page.rig import bend, bone_poses, capsule, rigs, strongest
 from magnet.motion.scene import Scene
 
 MILLIMETRE = 1e-3
@@ -74,7 +75,7 @@ def test_bones_of_a_body_at_rest_are_turned_as_its_pelvis_is(duet: Scene, body: 
     torch.testing.assert_close(rotations, still.T_world_root[0, ..., None, :3, :3].expand_as(rotations))
 
 
-@pytest.mark.parametrize("style", VIEWS)
+@pytest.mark.parametrize("style", STYLES)
 def test_each_style_has_whole_meshes_with_weights_that_sum_to_one(duet: Scene, body: Body, style) -> None:
     for rig in rigs(body, duet.betas[0], style):
         skin = rig.skin
