@@ -1,7 +1,7 @@
 """The command `magnet`.
 
-The `main(arguments)` of each command returns the exit code; it raises CommandError, ValueError, ImportError or OSError
-for what the user can put right, with a message that says how.
+The `main(arguments)` of each command returns the exit code. What the user can put right is a CommandError, which any
+function here may raise, or a ValueError, ImportError or OSError from below; its message says how.
 """
 
 from magnet.cli.main import main as main

@@ -118,11 +118,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def peers(connect: Sequence[str], names: Sequence[str], me: str, listen: str = "") -> dict[str, str]:
-    """Addresses by name.
-
-    Raises:
-        CommandError: not of the form NAME=ADDRESS, nobody of the scene, somebody twice, one's own address, or no port.
-    """
+    """Addresses by name."""
     found: dict[str, str] = {}
     for address in (listen, *(each.partition("=")[2] for each in connect)):
         port = re.fullmatch(r"tcp://.*:(\d+)", address)

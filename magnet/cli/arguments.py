@@ -24,11 +24,7 @@ class Arguments:
 
     @classmethod
     def split(cls, arguments: Sequence[str]) -> Arguments:
-        """Take the configuration files out, so that they go first and any flag beats any file.
-
-        Raises:
-            CommandError: as `read_layers`.
-        """
+        """Take the configuration files out, so that they go first and any flag beats any file."""
         named, flags = taken_out(arguments, r"(--config|-c)(=|$)")
         found = cls(flags, [flag.partition("=")[2] + "".join(value) for flag, *value in named])
         found.layers = [layer for file in found.files for layer in read_layers(file)]
@@ -41,11 +37,7 @@ class Arguments:
         return [layer.options for layer in self.layers]
 
     def flag(self, key: str) -> str | None:
-        """The value of a flag; of several the last.
-
-        Raises:
-            CommandError: the flag is the last word, without a value.
-        """
+        """The value of a flag; of several the last."""
         value = None
         for argument, after in zip(self.flags, [*self.flags[1:], None], strict=False):
             name, equals, text = argument.partition("=")

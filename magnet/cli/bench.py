@@ -97,11 +97,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What another run has written.
-
-    Raises:
-        CommandError: no such file, or not of this command.
-    """
+    """What another run has written."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         for case in found["cases"].values():
@@ -122,11 +118,7 @@ def _positive(numbers: Iterable[Any]) -> None:
 
 
 def task_options(flags: Mapping[str, list[str]], tasks: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What was asked of each task: those of the options that it has.
-
-    Raises:
-        CommandError: an option that none of the tasks has, one that a task needs, or a value that does not fit.
-    """
+    """What was asked of each task: those of the options that it has."""
     from magnet.cli.tasks import parse_task, task_class
 
     has = {task: {each.name for each in dataclasses.fields(task_class(task))} for task in tasks}

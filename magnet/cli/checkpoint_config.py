@@ -35,11 +35,7 @@ class Stored:
 
     @classmethod
     def read(cls, path: Path) -> Stored:
-        """Read them.
-
-        Raises:
-            CommandError: no checkpoint, a damaged one, or one of a class that nobody here has named.
-        """
+        """Read them."""
         try:
             checkpoint = checkpoints.read(path)
         except (OSError, ValueError) as error:
@@ -98,9 +94,6 @@ def started(name: str, given: Arguments, models: dict[str, str], data_default: s
 
     Sizes, losses and noise are those of the checkpoint, and the data, of the class `data_default` unless the user names
     one, have its number of people and frames. models: modules of our models, by the class's short name
-
-    Raises:
-        CommandError: there is no such checkpoint.
     """
     try:
         checkpoint = checkpoints.read(checkpoints.resolve(name))
@@ -164,11 +157,7 @@ def tokens(window_frames: int) -> int:
 
 
 def refuse_linked(given: Arguments) -> None:
-    """Refuse a linked option that is not set where it comes from.
-
-    Raises:
-        CommandError: it is set at the model.
-    """
+    """Refuse a linked option that is not set where it comes from."""
     for source, target in LINKS.items():
         said = [given.flag(f"model.{target}"), given.flag(f"model.init_args.{target}")]
         for config in given.configs:
@@ -179,11 +168,7 @@ def refuse_linked(given: Arguments) -> None:
 
 
 def trusted(spec: Spec, path: Path) -> Spec:
-    """Refuse classes whose import could run code that nobody here has chosen.
-
-    Raises:
-        CommandError: the checkpoint names a class outside magnet that is not imported yet.
-    """
+    """Refuse classes whose import could run code that nobody here has chosen."""
     for name in class_paths(spec):
         if not chosen(name):
             raise CommandError(

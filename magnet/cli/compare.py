@@ -45,11 +45,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    """Run the command. Returns the exit code.
-
-    Raises:
-        CommandError: folders without results, rows that are not there, or no common scenes.
-    """
+    """Run the command. Returns the exit code."""
     given = parser().parse_args(list(arguments))
     if len(given.folders) > 2 or (len(given.folders) == 1 and not given.rows):
         many = len(given.folders)
@@ -64,11 +60,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def read(folder: Path) -> tuple[Results, SceneValues]:
-    """The results in a folder, and the values of their scenes.
-
-    Raises:
-        CommandError: there are none.
-    """
+    """The results in a folder, and the values of their scenes."""
     from magnet.evaluation.by_scene import SceneValues
     from magnet.evaluation.results import Results
 
@@ -89,11 +81,7 @@ def show(
     full: bool,
     folders: Sequence[Path],
 ) -> None:
-    """Print what is compared, and the table.
-
-    Raises:
-        CommandError: no scene is in both, or no number.
-    """
+    """Print what is compared, and the table."""
     import sys
 
     from rich.console import Console

@@ -36,11 +36,7 @@ class Layer:
 
 
 def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
-    """A configuration file behind those that it extends, in the order in which later ones win.
-
-    Raises:
-        CommandError: a file that is not there, is no YAML, holds no mapping, or extends itself.
-    """
+    """A configuration file behind those that it extends, in the order in which later ones win."""
     options = dict(read_yaml(file))
     here = Path(file).resolve()
     if here in within:
@@ -55,11 +51,7 @@ def read_layers(file: str, within: tuple[Path, ...] = ()) -> list[Layer]:
 
 
 def read_yaml(file: str) -> dict[str, Any]:
-    """The options in a file.
-
-    Raises:
-        CommandError: it is not there, is no YAML, or holds no mapping.
-    """
+    """The options in a file."""
     path = Path(file)
     if not path.is_file():
         near = sorted(str(p) for p in path.parent.glob("[!.]*.yaml")) if path.parent.is_dir() else []
@@ -82,11 +74,7 @@ def read_yaml(file: str) -> dict[str, Any]:
 
 
 def require_classes(file: str, options: object, place: str = "") -> None:
-    """Refuse a class that is not named by a word, and options of one that are no options.
-
-    Raises:
-        CommandError: names the file and the place in it.
-    """
+    """Refuse a class that is not named by a word, and options of one that are no options."""
     groups = options.items() if isinstance(options, dict) else enumerate(options) if isinstance(options, list) else ()
     for key, value in groups:
         where = f"{place}[{key}]" if isinstance(key, int) else f"{place}.{key}".lstrip(".")
@@ -98,11 +86,7 @@ def require_classes(file: str, options: object, place: str = "") -> None:
 
 
 def with_presets(options: dict[str, Any]) -> dict[str, Any]:
-    """Options with `sampler: NAME`, or `preset: NAME` among the sampler's, replaced by the preset's values.
-
-    Raises:
-        CommandError: no such preset.
-    """
+    """Options with `sampler: NAME`, or `preset: NAME` among the sampler's, replaced by the preset's values."""
     sampler = options.get("sampler")
     if isinstance(sampler, str) and is_preset(sampler):
         return {**options, "sampler": sampler_preset(sampler)}
@@ -118,11 +102,7 @@ def is_preset(word: str) -> bool:
 
 
 def sampler_preset(name: str) -> dict[str, Any]:
-    """Every sampler option as a preset has it.
-
-    Raises:
-        CommandError: no such preset; names the closest.
-    """
+    """Every sampler option as a preset has it."""
     from magnet.sampling.options import SamplerOptions
 
     try:

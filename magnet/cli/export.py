@@ -154,11 +154,7 @@ def out_before_rig(arguments: Sequence[str]) -> list[str]:
 
 
 def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
-    """Refuse options that a format has no use for.
-
-    Raises:
-        CommandError: names the option and what it is for.
-    """
+    """Refuse options that a format has no use for."""
     from magnet.export.formats import PICTURES, USD
 
     shown = (".html", ".png", *PICTURES)
@@ -185,11 +181,7 @@ def refuse_unused(options: argparse.Namespace, suffix: str) -> None:
 
 
 def only(scene: Scene, people: Sequence[int]) -> Scene:
-    """The scene with these people alone, who keep their slots and so their colours.
-
-    Raises:
-        CommandError: nobody of that number is there.
-    """
+    """The scene with these people alone, who keep their slots and so their colours."""
     import torch
 
     there = scene.present.any(dim=0).nonzero()[:, 0].tolist()

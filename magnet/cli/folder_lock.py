@@ -21,9 +21,6 @@ def held(folder: Path) -> Iterator[None]:
 
     The lock goes with the process, however it ends. Where no lock can be had, the training runs without: a folder that
     cannot be written is told of later, and some network file systems have no locks.
-
-    Raises:
-        CommandError: another training works there.
     """
     if not first_process():
         yield
@@ -62,11 +59,7 @@ def _leave(made: list[Path]) -> None:
 
 
 def refuse_overwriting(folder: Path) -> None:
-    """Refuse a new training where one has been.
-
-    Raises:
-        CommandError: there are checkpoints of one.
-    """
+    """Refuse a new training where one has been."""
     place = folder / "checkpoints"
     if not place.exists() or started_by_lightning():
         return

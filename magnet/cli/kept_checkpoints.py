@@ -16,22 +16,14 @@ NAMED = 3
 
 
 def checkpoint_of(name: str | None, option: str = "--ckpt_path") -> Path:
-    """The checkpoint that an option names; where it is `last` or `best` of the runs here, a line says which that is.
-
-    Raises:
-        CommandError: there is none; says which there are.
-    """
+    """The checkpoint that an option names; where it is `last` or `best` of the runs here, a line says which that is."""
     return say_which(name, find_checkpoint(name, [RUNS], option=option), option)
 
 
 def find_checkpoint(
     name: str | None, folders: Iterable[Path], runs: Path | None = None, option: str = "--ckpt_path"
 ) -> Path:
-    """What an option means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name.
-
-    Raises:
-        CommandError: there is none; says which there are in `runs`.
-    """
+    """What an option means: a path, `last` or `best` of the newest run in `folders`, or shipped weights by name."""
     if name in ("last", "best"):
         folders = list(folders)
         found = [file for folder in folders for file in folder.glob(f"**/checkpoints/{name}.ckpt")]

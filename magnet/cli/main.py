@@ -141,11 +141,7 @@ def underscored(argument: str) -> str:
 
 
 def run(command: str, arguments: list[str]) -> int:
-    """Run one command.
-
-    Raises:
-        CommandError: no such command.
-    """
+    """Run one command."""
     if command == "predict":
         if predict_files.meant(arguments):
             return predict_files.main(arguments)

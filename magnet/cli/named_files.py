@@ -40,11 +40,7 @@ def runs(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 
 def require_there(paths: Sequence[str]) -> None:
-    """Refuse files to read that are not there; of those of other kinds the reader says what it reads.
-
-    Raises:
-        CommandError: names the first, and says where it may be a piece of a path.
-    """
+    """Refuse files to read that are not there; of those of other kinds the reader says what it reads."""
     missing = [path for path in paths if not Path(path).exists() and Path(path).suffix.lower() in (*READ, "")]
     if missing:
         pieces = any(not Path(path).exists() and Path(path).suffix.lower() not in READ for path in paths)
@@ -53,11 +49,7 @@ def require_there(paths: Sequence[str]) -> None:
 
 
 def require_whole(outs: Sequence[str]) -> None:
-    """Refuse a file to write that may be a piece of a path: one without a suffix, and another behind it.
-
-    Raises:
-        CommandError: says how to write the path.
-    """
+    """Refuse a file to write that may be a piece of a path: one without a suffix, and another behind it."""
     for out, behind in pairwise(outs):
         if not Path(out).suffix:
             whole = f'--out "{out} {behind}"'

@@ -69,9 +69,6 @@ def refuse_both(flags: Sequence[str], config: Namespace, checkpoint: Any = None)
         flags: of the command line.
         config: what is chosen, by the command line, by files of options, or by the run that goes on.
         checkpoint: the file that a run goes on from, whose optimizer goes on with it.
-
-    Raises:
-        CommandError: names the first such flag.
     """
     own = r"--model\.(init_args\.)?optimizer[.=]"
     if config.get("optimizer") and (both := next((flag for flag in flags if re.match(own, flag)), None)):

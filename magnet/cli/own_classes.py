@@ -24,11 +24,7 @@ DOTTED = r"[^\W\d]\w*(?:\.[^\W\d]\w*)+"
 
 
 def import_named(given: Arguments) -> None:
-    """Import the classes that a user names by a dotted path, also out of the working directory.
-
-    Raises:
-        CommandError: such a module is there and cannot be imported.
-    """
+    """Import the classes that a user names by a dotted path, also out of the working directory."""
     from magnet.datamodules.registry import import_local
 
     named = [(f"--{key}", given.class_of(key), key == "data") for key in ("model", "data")]

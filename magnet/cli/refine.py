@@ -103,11 +103,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def refuse_contradictions(options: argparse.Namespace) -> None:
-    """Refuse options that do not go together, or that cannot be.
-
-    Raises:
-        CommandError: names the first.
-    """
+    """Refuse options that do not go together, or that cannot be."""
     if not 0 <= options.slides < float("inf"):
         raise CommandError(f"--slides {options.slides:g}: expected a speed in m/s, 0 or more")
     if options.shapes and (options.keep or options.poses == "keep"):
@@ -119,11 +115,7 @@ def refuse_contradictions(options: argparse.Namespace) -> None:
 
 
 def require_somebody(options: argparse.Namespace, scene: Scene) -> None:
-    """Refuse a scene in which there is nothing to refine, or nobody whom --keep means.
-
-    Raises:
-        CommandError: says what is missing.
-    """
+    """Refuse a scene in which there is nothing to refine, or nobody whom --keep means."""
     file = options.inputs[0]
     if not scene.frames or not bool(scene.present.any()):
         raise CommandError(f"{file}: holds no {'people' if scene.frames else 'frames'}, so there is nothing to refine")
@@ -142,9 +134,6 @@ def shapes_of(options: argparse.Namespace, how: Reading, got: Read) -> Tensor:
     """The shapes that --shapes says, for everybody. -> (B, P, 10)
 
     how: its files are read, but for their length, which shapes do not have.
-
-    Raises:
-        CommandError: the file's people are too few, or its shapes are of another body.
     """
     from magnet.export.reading import read
 

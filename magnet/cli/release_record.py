@@ -43,9 +43,6 @@ def about(
     """The record of a denoiser's checkpoint, and of the tokenizer's whose decoder it has taken.
 
     trained_on, licence: what the user says of data and weights
-
-    Raises:
-        CommandError: one of these is needed.
     """
     own, before = origins.data_of(checkpoint), origins.started_from(checkpoint)
     if decoder is not None:

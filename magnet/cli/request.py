@@ -70,9 +70,6 @@ def read_request(command: str, arguments: list[str], models: dict[str, str]) -> 
     """Read the files and the checkpoint that a command line names, and settle who beats whom.
 
     models: modules of our models, by the class's short name
-
-    Raises:
-        CommandError: something the user can put right.
     """
     given = Arguments.split(arguments)
     own_classes.import_named(given)
@@ -113,11 +110,7 @@ def tell_apart(given: Arguments) -> None:
 
 
 def options_below(command: str, given: Arguments, checkpoint: Path | None, models: dict[str, str]) -> dict[str, Any]:
-    """The lowest layer of options: those of the checkpoint, or of the one that a new training starts from.
-
-    Raises:
-        CommandError: no such checkpoint, or one that cannot be taken.
-    """
+    """The lowest layer of options: those of the checkpoint, or of the one that a new training starts from."""
     fit, data = command == "fit", registry.default_path()
     if checkpoint is None:
         start = given.option("model", "start_from") if fit else None
@@ -128,11 +121,7 @@ def options_below(command: str, given: Arguments, checkpoint: Path | None, model
 
 
 def require_folder_name(command: str, out: str | None) -> None:
-    """Refuse the name of a file for a run's folder.
-
-    Raises:
-        CommandError: says what is expected.
-    """
+    """Refuse the name of a file for a run's folder."""
     if out and Path(out).suffix.lower() in FILES and not Path(out).is_dir():
         first = "; files to go on from stand before --out: magnet predict A.bvh --out o.glb"
         hint = first if command == "predict" else ""
@@ -142,11 +131,7 @@ def require_folder_name(command: str, out: str | None) -> None:
 
 
 def sampled_task(command: str, given: Arguments, fields: list[str], settled: class_options.Settled) -> TaskChoice:
-    """The task that is sampled, by flags of its options (`fields`) over files; it is taken out of the layers.
-
-    Raises:
-        CommandError: no such task or option, or a value that does not fit.
-    """
+    """The task that is sampled, by flags of its options (`fields`) over files; it is taken out of the layers."""
     specs = [class_options.spec_of(each.options.pop("task", None)) for each in settled.layers]
     name = settled.classes.get("task", DEFAULT_TASK).rpartition(".")[2]
     said = [*fields, *given.of("task")]
@@ -158,11 +143,7 @@ def sampled_task(command: str, given: Arguments, fields: list[str], settled: cla
 
 
 def require_data(name: str | None, files: list[str], flags: list[str]) -> None:
-    """Refuse the short name of a data set that there is not, in a file or a flag, before anything else is told of it.
-
-    Raises:
-        CommandError: says why it failed to load where a package offers it, or else what there is.
-    """
+    """Refuse the short name of an unknown data set, in a file or a flag, before anything else is told of it."""
     known = registry.classes()
     if name is None or name in known or not name.isidentifier():
         return  # of anything but a short name the parser says what is wrong
@@ -182,11 +163,7 @@ def run_name(command: str, files: list[str]) -> str:
 
 
 def which_checkpoint(command: str, given: Arguments, runs: Path, run: str) -> Path | None:
-    """The checkpoint to start from; None for training from nothing. A fit goes on with its own, others take any run's.
-
-    Raises:
-        CommandError: it is not there.
-    """
+    """The checkpoint to start from, None for a new training. A fit goes on with its own, others take any run's."""
     name, out = given.value("ckpt_path"), given.value("out")
     if name is None and command == "fit" and out and not given.only_shown:
         return checkpoints.requeued(Path(out))
@@ -214,11 +191,7 @@ def seed_of_samples(files: Sequence[Layer], flags: list[str]) -> list[Layer]:
 
 
 def sampler_words(command: str, flags: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it.
-
-    Raises:
-        CommandError: no such preset.
-    """
+    """A preset that `--sampler NAME` asks for, as options below all flags; and the other flags, which beat it."""
     name = Arguments(flags).flag("sampler")
     if command not in SAMPLING or name is None or not config_files.is_preset(name):
         return {}, flags
@@ -229,9 +202,6 @@ def refuse_task(request: Request, model: object) -> None:
     """Refuse a task, and options of sampling, for a model that samples none: it is tested by losses of its own.
 
     Those of a file are passed over, for the configuration of any run of `test` has them.
-
-    Raises:
-        CommandError: the command line names one.
     """
     held = f"{request.checkpoint or 'model'} holds a {type(model).__name__.lower()}"
     if request.task is not None and request.task.asked:

@@ -27,9 +27,6 @@ def trained_with(checkpoint: Path, given: Arguments) -> dict[str, Any]:
     """Options of the Trainer, and a chosen optimizer, of the run that a checkpoint is of, by its config.yaml.
 
     Whoever says how long it is to train now, or names callbacks, says all of that.
-
-    Raises:
-        CommandError: a damaged file, or a class in it that nobody here has named.
     """
     file, said = _run_of(checkpoint)
     if not said:

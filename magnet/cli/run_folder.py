@@ -60,9 +60,6 @@ def run_folder(root: Path, out: str | None) -> Path:
     """Folder of this run: `out`, else one under `root` named by the time, to be `claimed`.
 
     `Record` tells it to other processes.
-
-    Raises:
-        CommandError: `out` is a file.
     """
     folder = Path(out) if out else root / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     if folder.is_file():

@@ -45,9 +45,6 @@ def loggers(folder: Path, chosen: Any, wandb: str | None, fit: bool, goes_on: bo
         wandb: online or offline, to log to Weights & Biases too.
         fit: this is a training.
         goes_on: in the folder of the training that it goes on with.
-
-    Raises:
-        CommandError: wandb is asked for and not installed, or said twice, or no logger is wanted.
     """
     if chosen is False:
         if wandb is not None:

@@ -17,11 +17,7 @@ LARGEST = 2**63 - 1
 
 
 def require_numbers(config: Any) -> None:
-    """Refuse numbers of the Trainer's, in a command's parsed options, that it takes and then fails on.
-
-    Raises:
-        CommandError: names the option, what was got and what was expected.
-    """
+    """Refuse numbers of the Trainer's, in a command's parsed options, that it takes and then fails on."""
     seed, trainer = config.get("seed_everything"), config.get("trainer") or {}
     if isinstance(seed, int) and not isinstance(seed, bool) and not 0 <= seed <= MOST_SEED:
         raise CommandError(f"--seed_everything {seed}: expected 0 to {MOST_SEED}")

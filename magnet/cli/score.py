@@ -77,11 +77,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
 
 def example(given: argparse.Namespace, benchmark: Benchmark, data: MotionDataModule) -> Path:
-    """Write a submission of the method that --method names. Returns its path.
-
-    Raises:
-        CommandError: another number of samples, or no such checkpoint.
-    """
+    """Write a submission of the method that --method names. Returns its path."""
     from magnet.cli.kept_checkpoints import checkpoint_of
     from magnet.denoiser.core import DenoiserCore
     from magnet.evaluation import methods

@@ -16,11 +16,7 @@ HELP = ("-h", "--help")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`magnet tasks`: all tasks, and the plug-ins that failed to load; `magnet tasks show NAME`: its schedule.
-
-    Raises:
-        CommandError: neither of these.
-    """
+    """`magnet tasks`: all tasks, and the plug-ins that failed to load; `magnet tasks show NAME`: its schedule."""
     command, *rest = arguments or ["list"]
     if command == "show":
         if rest[:1] and rest[0] in HELP:

@@ -69,11 +69,7 @@ def listed(value: Any) -> Any:
 
 
 def task_class(name: str) -> type:
-    """A task's class by its name.
-
-    Raises:
-        CommandError: no such task; names the closest one.
-    """
+    """A task's class by its name."""
     try:
         return registry.get(name)
     except ValueError as error:
@@ -96,9 +92,6 @@ def parse_task(
     """A task from its flags over options from files (`below`, later ones win); the only way there is to read one.
 
     command: whose help is named in errors
-
-    Raises:
-        CommandError: no such task or option, or a value that does not fit.
     """
     kind = task_class(name)
     parser = task_parser(kind)
@@ -126,11 +119,7 @@ def made(kind: type, fields: Mapping[str, Any]) -> Any:
 def read_fields(
     parser: ArgumentParser, flags: list[str], below: Iterable[Mapping[str, Any]], more: str
 ) -> dict[str, Any]:
-    """Options from files, overridden by flags.
-
-    Raises:
-        CommandError: an option that there is not, or a value that does not fit.
-    """
+    """Options from files, overridden by flags."""
     try:
         cfg = parser.get_defaults(skip_validation=True)
         for options in below:
@@ -264,11 +253,7 @@ class Shown:
 
 
 def show_task(arguments: list[str]) -> int:
-    """Draw the noise levels of a task's schedule, to a PNG or the terminal.
-
-    Raises:
-        CommandError: no such task or option, or a task that makes no sense at these sizes.
-    """
+    """Draw the noise levels of a task's schedule, to a PNG or the terminal."""
     from rich.console import Console
     from rich.text import Text
 

@@ -59,11 +59,7 @@ EVERYTHING = {
 
 
 def run_trainer(command: str, arguments: list[str]) -> int:
-    """Parse and run one of the Trainer's commands.
-
-    Raises:
-        CommandError: something the user can put right.
-    """
+    """Parse and run one of the Trainer's commands."""
     quiet()
     if (topic := help_topic(arguments)) is not None:
         print(answers.kept(f"{command} help {topic}", lambda: help_parser(command, topic).format_help()), end="")
@@ -91,11 +87,7 @@ def run_trainer(command: str, arguments: list[str]) -> int:
 
 
 def help_parser(command: str, topic: str = "") -> Parser:
-    """The parser that tells a command's help.
-
-    Raises:
-        CommandError: no such topic.
-    """
+    """The parser that tells a command's help."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
         MagnetCLI(Request(command, ["--help"], task=TaskChoice(DEFAULT_TASK, {}), topic=topic))
     assert Parser.root is not None
