@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnet.cli import predict_keys, predict_written, scene_files
+from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import flat, taken_out
 from magnet.cli.named_files import READ, require_there, require_whole
-from magnet.cli.predict_lengths import CONTEXT, FUTURE, lengths
+from magnet.cli.scene_files import CONTEXT, FUTURE
 from magnet.sampling.presets import PRESETS
 
 if TYPE_CHECKING:
@@ -148,7 +148,9 @@ def main(arguments: Sequence[str]) -> int:
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     scene_files.refuse_unused_look(options, [out.suffix.lower() for out in outs])
     from magnet.api import Model, Motion
+    from magnet.cli import predict_keys, predict_written
     from magnet.cli.kept_checkpoints import checkpoint_of
+    from magnet.cli.predict_lengths import lengths
     from magnet.denoiser.core import DenoiserCore
     from magnet.generation.plan import plan_of_scene
     from magnet.motion.tokens import TOKEN_FRAMES
@@ -194,11 +196,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def require_counts(options: argparse.Namespace) -> None:
-    """Refuse numbers of frames and samples that cannot be.
-
-    Raises:
-        CommandError: names the option.
-    """
+    """Refuse numbers of frames and samples that cannot be."""
     for name, (least, most) in COUNTS.items():
         value = getattr(options, name)
         if value is not None and not least <= value <= most:
@@ -206,11 +204,7 @@ def require_counts(options: argparse.Namespace) -> None:
 
 
 def require_files(paths: Sequence[str]) -> None:
-    """Refuse files that are not there, and folders in their place.
-
-    Raises:
-        CommandError: names what is wrong.
-    """
+    """Refuse files that are not there, and folders in their place."""
     require_there(paths)
     for path in map(Path, paths):
         if path.is_dir():
@@ -244,11 +238,7 @@ def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
 
 
 def people_written(options: argparse.Namespace, scene: Scene) -> list[int]:
-    """How many people are there in each scene that will be written.
-
-    Raises:
-        CommandError: no files and no people, or fewer people than files hold.
-    """
+    """How many people are there in each scene that will be written."""
     people = scene.agents if options.people is None else options.people
     if people < max(scene.agents, 1):
         raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
@@ -260,9 +250,6 @@ def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[
     """The scene of all files with room for those who are made from nothing, and the slots of these.
 
     A crowd is composed of the files' people, again and again, or of couples that the model makes.
-
-    Raises:
-        CommandError: a crowd of which nothing is given.
     """
     import torch
 
@@ -301,11 +288,7 @@ def start_of_crowd(options: argparse.Namespace, scene: Scene) -> Scene:
 
 
 def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:
-    """The task; where people are added and it is for some of the people, it is for these.
-
-    Raises:
-        CommandError: no such task or option, or a value that does not fit.
-    """
+    """The task; where people are added and it is for some of the people, it is for these."""
     from magnet.cli.tasks import parse_task, task_class
 
     name = options.task or ("joint_future" if options.inputs or options.context else "generation")
@@ -315,11 +298,7 @@ def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...
 
 
 def sampler_of(preset: str, flags: list[str]) -> SamplerOptions:
-    """How to sample.
-
-    Raises:
-        CommandError: no such preset or option, or a value that does not fit.
-    """
+    """How to sample."""
     from jsonargparse import ArgumentParser
 
     from magnet.cli.config_files import sampler_preset

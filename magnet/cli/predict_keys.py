@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from torch import Tensor
 
-    from magnet.motion.scene import Scene
+from magnet.export.upright import WARNING
+from magnet.generation.keyframes import HURRIED, keyframe, pace, speeds
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES
 
 STILL = 1e-4
 """Metres, or numbers of a rotation, that frames of one pose differ by at most: rounding."""
@@ -22,9 +23,6 @@ def said_of_keys(recorded: Scene, known: Tensor, past: int) -> list[str]:
         known: (N, P) bool, token steps that are read.
         past: token steps that are given of everybody at the start.
     """
-    from magnet.export.upright import WARNING
-    from magnet.generation.keyframes import HURRIED, pace
-
     reached: dict[tuple[int, int], float] = {}
     held: set[tuple[int, int]] = set()
     for b in range(recorded.scenes):
@@ -52,9 +50,6 @@ def speeds_of(scene: Scene, person: int, steps: Tensor, past: int) -> dict[int, 
 
     scene: B = 1; steps (N,) bool, known of that person -> by first frame
     """
-    from magnet.generation.keyframes import keyframe, speeds
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     there = [step for step in steps.nonzero()[:, 0].tolist() if step >= past and step * TOKEN_FRAMES < scene.frames]
     if not there or bool(steps.all()):
         return {}
@@ -69,8 +64,6 @@ def held_in(scene: Scene, person: int, steps: Tensor, past: int) -> list[int]:
 
     scene: B = 1; steps (N,) bool, known of that person
     """
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     found = []
     for step in (past + steps[past:].nonzero()[:, 0]).tolist():
         frames = slice(step * TOKEN_FRAMES, min((step + 1) * TOKEN_FRAMES, scene.frames))

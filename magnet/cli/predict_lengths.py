@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import argparse
 import functools
-from typing import TYPE_CHECKING
 
+from torch import Tensor
+
+from magnet.api import Model
 from magnet.cli.errors import CommandError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from magnet.api import Model
-    from magnet.cli.tasks import TaskChoice
-    from magnet.motion.scene import Scene
-    from magnet.sampling.schedule import MaskSchedule
-    from magnet.tasks.base import Task
-
-CONTEXT = 32
-"""Frames given of everybody where nothing is said and the task reads what comes later, as in its tests: a second."""
-FUTURE = 150
-"""Frames that are sampled where nothing is said and nothing recorded is read: five seconds."""
+from magnet.cli.scene_files import CONTEXT, FUTURE
+from magnet.cli.tasks import TaskChoice
+from magnet.generation.plan import plan_of_scene
+from magnet.motion.scene import FPS, Scene
+from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.schedule import MaskSchedule
+from magnet.tasks.base import Task
+from magnet.tasks.inbetweening import Inbetweening
 
 
 def lengths(
@@ -34,9 +30,6 @@ def lengths(
         CommandError: the task reads motion that was not recorded.
         ValueError: the task makes no sense at these sizes.
     """
-    from magnet.generation.plan import plan_of_scene
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)
     recorded = scene.frames // TOKEN_FRAMES * TOKEN_FRAMES if options.inputs or crowd else 0
@@ -76,13 +69,7 @@ def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing:
         frames: of the files.
         recorded: of these, in whole tokens.
         nothing: what is not said is 0: somebody is made from nothing.
-
-    Raises:
-        CommandError: more than there is, or less than a token.
     """
-    from magnet.motion.scene import FPS
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     if options.inputs and not recorded:
         raise CommandError(f"the files hold {frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
     context: int | None = options.context
@@ -110,8 +97,6 @@ def fitting(context: int, task: Task, recorded: int, plan: MaskSchedule) -> int:
         recorded: frames of the files, in whole tokens.
         plan: of the task with this context, and with more frames after it than are recorded, or asked for.
     """
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     known, tokens, last = plan.known, context // TOKEN_FRAMES, recorded // TOKEN_FRAMES
     if not bool(known[:tokens].all()):
         return 0
@@ -122,20 +107,11 @@ def fitting(context: int, task: Task, recorded: int, plan: MaskSchedule) -> int:
 
 def keys_of(task: Task, recorded: int) -> list[int]:
     """Token steps of the keyframes that a task names, in so many recorded frames."""
-    from magnet.motion.tokens import TOKEN_FRAMES
-    from magnet.tasks.inbetweening import Inbetweening
-
     return task.named(recorded // TOKEN_FRAMES) if isinstance(task, Inbetweening) else []
 
 
 def require_recorded(task: str, context: int, recorded: int, known: Tensor, crowd: bool) -> None:
-    """Refuse a task that reads more than is recorded. known (N, P) bool
-
-    Raises:
-        CommandError: it does; says what it takes.
-    """
-    from magnet.motion.tokens import TOKEN_FRAMES
-
+    """Refuse a task that reads more than is recorded. known (N, P) bool"""
     needed = (int(known.any(dim=1).nonzero()[-1]) + 1) * TOKEN_FRAMES
     if needed <= recorded:
         return

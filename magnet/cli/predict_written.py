@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from torch import Tensor
 
-    from magnet.motion.scene import Scene
+from magnet.generation.unmade import given_invalid, sound
+from magnet.motion.scene import Scene
+from magnet.motion.tokens import TOKEN_FRAMES
 
 NAMED = 4
 """People who are named one by one; of more, a line says how many."""
@@ -19,8 +19,6 @@ def in_front(recorded: Scene, read: Scene) -> tuple[Scene, int]:
 
     What is read are whole tokens from the end of the files, so that up to three frames stand before it. They are said.
     """
-    from magnet.generation.unmade import sound
-
     if not (lead := recorded.frames - read.frames):
         return recorded, 0
     bad = (~sound(recorded.slice(0, lead)).all(dim=0)).nonzero()[:, 0]
@@ -38,9 +36,6 @@ def said_of_unmade(task: str, recorded: Scene, lead: int, frames: int, unmade: T
 
     frames: of what is written behind the first `lead`; else as for `magnet.generation.unmade.completed`.
     """
-    from magnet.generation.unmade import sound
-    from magnet.motion.tokens import TOKEN_FRAMES
-
     good = sound(recorded).all(dim=0).nonzero()[:, 0]
     end = min(int(good[-1]) + 1 if len(good) else 0, lead + frames)
     there = recorded.present.any(dim=0)
@@ -67,8 +62,6 @@ def said_of_invalid(scene: Scene, known: Tensor, lead: int) -> list[str]:
     known: (N, P) bool, token steps of people that the task reads.
     lead: frames of the files before the first frame of `scene`.
     """
-    from magnet.generation.unmade import given_invalid
-
     bad = given_invalid(scene, known).any(dim=0).nonzero()[:, 0]
     if not len(bad):
         return []

@@ -45,6 +45,9 @@ END: dict[str, Any] = {
 """Options that choose a part of what commands read, counted at the file's own rate."""
 PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
 """An option that names a person, and may be repeated."""
+CONTEXT, FUTURE = 32, 150
+"""Frames that `magnet predict` gives of everybody, a second as in the tests of tasks, and frames that it samples where
+nothing recorded is read: where nothing is said."""
 MOMENTS, SAME_PLACE = 30, 0.02
 """Frames that are looked at, and metres between pelvises in all of them that no two bodies leave each other."""
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
@@ -71,11 +74,7 @@ def add_body(options: Options) -> None:
 
 
 def require_no_files_meant(arguments: Sequence[str]) -> None:
-    """Refuse options of files where no file and no people are named, so that a data set is to be sampled.
-
-    Raises:
-        CommandError: names the option, and the two ways to say what is meant; or a word in the place of a file.
-    """
+    """Refuse options of files where no file and no people are named, so that a data set is to be sampled."""
     first, outs = next(iter(arguments), "-"), [value for name, value in valued(arguments) if name == "--out"]
     if not first.startswith("-") and any(Path(out).suffix for out in outs):
         raise CommandError(f"{first}: no such file; the name of a file to read ends in {', '.join(READ)}")
@@ -88,11 +87,7 @@ def require_no_files_meant(arguments: Sequence[str]) -> None:
 
 
 def require_files_to_cut(inputs: Sequence[str], start: int, end: int | None) -> None:
-    """Refuse --start and --end where no files are read.
-
-    Raises:
-        CommandError: names the option.
-    """
+    """Refuse --start and --end where no files are read."""
     if not inputs and (start or end is not None):
         said = f"--start {start}" if start else f"--end {end}"
         raise CommandError(f"{said}: chooses frames of files, and none are read; name a file, or leave it out")
@@ -182,9 +177,6 @@ def require_unread(
         inputs: files that are read.
         people: slots of who is there in each scene that is written, or how many, who then have the first ones.
         smplx, each, rigs: as for `formats.files_of`.
-
-    Raises:
-        CommandError: names the input.
     """
     from magnet.export import formats
 
@@ -227,11 +219,7 @@ def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
 
 
 def require_inputs(inputs: Sequence[str], outs: Sequence[str]) -> None:
-    """Refuse a command line in which --out has taken the files to read.
-
-    Raises:
-        CommandError: says how to write it.
-    """
+    """Refuse a command line in which --out has taken the files to read."""
     if outs and not inputs:
         first, *behind = outs
         right = f"{shlex.join(behind)} --out {first}" if behind else f"A.bvh B.bvh --out {first}"
@@ -245,9 +233,6 @@ def require_not_there(inputs: Sequence[str], outs: Sequence[str]) -> None:
     """Refuse files behind the first of --out that could be meant to be read: they are there, and it is not.
 
     Where a command is given again, the first is there as well.
-
-    Raises:
-        CommandError: says how to write either.
     """
     first, *behind = outs
     known = {*map(Path, inputs)}  # what is read is refused by name
@@ -265,11 +250,7 @@ def require_not_there(inputs: Sequence[str], outs: Sequence[str]) -> None:
 
 
 def require_each_once(inputs: Sequence[str]) -> None:
-    """Refuse one file for two people, whose bodies would be in each other.
-
-    Raises:
-        CommandError: names the file, and for whom it is named.
-    """
+    """Refuse one file for two people, whose bodies would be in each other."""
     read: dict[tuple[int, int], int] = {}
     for person, path in enumerate(map(Path, inputs)):
         if not path.exists():
@@ -311,9 +292,6 @@ def refuse_unused(
 
     plain: its default, which nobody has to have said
     takes: suffixes of files that it changes; `suffixes` are those of the files to write
-
-    Raises:
-        CommandError: names the option and what it is for.
     """
     said = getattr(options, flag)
     if (tuple(said) if isinstance(said, list) and isinstance(plain, tuple) else said) == plain:
