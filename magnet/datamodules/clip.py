@@ -68,22 +68,14 @@ class Clip:
 
 
 def at_most(most: int, **numbers: int) -> None:
-    """No number is larger.
-
-    Raises:
-        ValueError: names the one that is.
-    """
+    """No number is larger."""
     for name, number in numbers.items():
         if number > most:
             raise ValueError(f"{name}: got {number}, expected at most {most:,}")
 
 
 def at_least(least: int, **numbers: int | None) -> None:
-    """Every number that is given is so large.
-
-    Raises:
-        ValueError: names the one that is not.
-    """
+    """Every number that is given is so large."""
     for name, number in numbers.items():
         if number is not None and number < least:
             raise ValueError(f"{name}: got {number}, expected at least {least}")

@@ -64,11 +64,7 @@ class Prepared(MotionDataModule):
 
     @cached_property
     def folder(self) -> StoreReader:
-        """The opened store.
-
-        Raises:
-            ValueError: as for the class.
-        """
+        """The opened store."""
         name = self.reader.name if self.reader else "NAME"
         command = f"magnet data prepare {name} --root DOWNLOAD --out STORE, then --data.path STORE"
         if not self.path:

@@ -273,11 +273,7 @@ def _body_of(held: Mapping[str, Any]) -> str:
 
 
 def _first(where: str, held: Mapping[str, Any], keys: Sequence[str], *otherwise: Any) -> Any:
-    """The value of the first of several keys that is present.
-
-    Raises:
-        DataError: none is present, and no default was given.
-    """
+    """The value of the first of several keys that is present."""
     for key in keys:
         if held.get(key) is not None:
             return held[key]

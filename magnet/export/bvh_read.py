@@ -64,11 +64,7 @@ def read_bvh(path: str | Path, gaps: bool = False, start: int = 0, end: int | No
 
 
 def bvh_lines(path: Path) -> list[str]:
-    """Lines of a text in UTF-8 or, as some programs on Windows write it, in UTF-16.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-    """
+    """Lines of a text in UTF-8 or, as some programs on Windows write it, in UTF-16."""
     try:
         raw = path.read_bytes()
     except FileNotFoundError as error:
@@ -143,11 +139,7 @@ def _motion(path: Path, lines: Sequence[str], header: BvhHeader) -> tuple[Floats
 
 
 def _require_finite(path: Path, first: int, finite: Bools, kept: slice) -> None:
-    """Refuse NaN in frames that are kept. first: line of the first frame; finite (T,)
-
-    Raises:
-        ValueError: names the line and the frame.
-    """
+    """Refuse NaN in frames that are kept. first: line of the first frame; finite (T,)"""
     bad = np.flatnonzero(~finite[kept])
     if len(bad):
         frame = (kept.start or 0) + int(bad[0])

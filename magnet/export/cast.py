@@ -141,11 +141,7 @@ def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
 
 
 def casts(scenes: Scenes, context_frames: int, body: Body | None, style: Style) -> tuple[list[str], list[Cast]]:
-    """Labels in characters that pictures have, and scenes ready for drawing; of the packaged body if none is given.
-
-    Raises:
-        ValueError: as `panels`, `cast` and `known_frames`.
-    """
+    """Labels in characters that pictures have, and scenes ready for drawing; of the packaged body if none is given."""
     labelled = panels(scenes)
     body = body or default_body(labelled[0][1])
     people = [cast(scene, body, style, known_frames(scene, context_frames)) for _, scene in labelled]

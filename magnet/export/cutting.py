@@ -33,11 +33,7 @@ def kept_frames(path: str | Path, frames: int, start: int, end: int | None) -> s
 
 
 def require_one_clock(paths: Sequence[str | Path], rates: Sequence[float], start: int, end: int | None) -> None:
-    """Refuse to cut files of different rates by one number of frames, which would be another moment in each.
-
-    Raises:
-        ValueError: names the rates.
-    """
+    """Refuse to cut files of different rates by one number of frames, which would be another moment in each."""
     if (start or end is not None) and len(set(rates)) > 1:
         each = ", ".join(f"{path} {rate:g} fps" for path, rate in zip(paths, rates, strict=True))
         raise ValueError(f"frame rates differ: {each}; --start and --end count frames, so cut each with magnet export")

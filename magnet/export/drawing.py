@@ -27,11 +27,7 @@ SMALLEST = 16
 
 
 def require_size(size: Size) -> None:
-    """Refuse a film's panel that nothing can be drawn in.
-
-    Raises:
-        ValueError: width or height is odd, or too small.
-    """
+    """Refuse a film's panel that nothing can be drawn in."""
     if size[0] % 2 or size[1] % 2:
         raise ValueError(f"size {size}: video needs even numbers of pixels")
     if min(size) < SMALLEST:

@@ -255,11 +255,7 @@ def left_over_said(written: Sequence[Path]) -> str:
 
 
 def require_frames(scene: Scene) -> None:
-    """Refuse a scene without frames, of which no file could be read again.
-
-    Raises:
-        ValueError: it has none.
-    """
+    """Refuse a scene without frames, of which no file could be read again."""
     if not scene.frames:
         raise ValueError(f"the scene has 0 frames of {scene.agents} people: there is nothing to write")
 

@@ -121,11 +121,7 @@ def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig
 
 
 def _people(file: GltfFile, needs_motion: bool = True) -> list[list[int]]:
-    """The joints of each person, each behind its parent, one root first.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """The joints of each person, each behind its parent, one root first."""
     groups: list[set[int]] = []
     for skin in file.document.get("skins", []):
         own = set(skin["joints"])
@@ -309,9 +305,6 @@ def _turn(matrix: Floats) -> Floats:
     """The rotation in a transform's (..., 3, 3): the nearest one, without its scale.
 
     A parent that is scaled along one axis skews what turns below it; joints are still where the file has them.
-
-    Raises:
-        ValueError: it mirrors, or makes flat.
     """
     length = np.linalg.norm(matrix, axis=-2, keepdims=True)
     turn = np.asarray(matrix / np.maximum(length, 1e-12), np.float64)

@@ -372,11 +372,7 @@ def _rate(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> f
 
 
 def require_own_rate(path: str | Path, fps: float, in_fps: float | None) -> None:
-    """Refuse to call the frame rate of a file another than it says.
-
-    Raises:
-        ValueError: `in_fps`, frames a second, is given, and is not what the file says.
-    """
+    """Refuse to call the frame rate of a file another than it says."""
     if in_fps is not None and abs(fps - in_fps) > 1e-6:
         raise ValueError(
             f"{path}: says {fps:g} frames a second; --in_fps {in_fps:g} is for files that say nothing, --fps resamples"

@@ -48,11 +48,7 @@ class RigMotion:
         return len(self.local)
 
     def require_near(self) -> None:
-        """Refuse places that no motion has, and numbers that are none.
-
-        Raises:
-            ValueError: names the file and how far a joint is away.
-        """
+        """Refuse places that no motion has, and numbers that are none."""
         if self.place.size and not (far := float(np.abs(self.place).max())) < MOST_AWAY:
             raise ValueError(f"{self.path}: a joint is {far:.2g} away from the one above: it is damaged")
 

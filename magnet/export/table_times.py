@@ -43,9 +43,6 @@ def require_one_recording(path: Path, values: Floats, told: Sequence[str], lines
         told: (N,) whose rows.
         lines: (N,) where they are in the file.
         what: the values are.
-
-    Raises:
-        ValueError: names the line where the second one begins.
     """
     for rows in _rows_of(told):
         own = values[rows]
@@ -71,11 +68,7 @@ def require_one_recording(path: Path, values: Floats, told: Sequence[str], lines
 def require_times_with_frames(
     path: Path, seconds: Floats, numbers: Floats, told: Sequence[str], lines: Sequence[int]
 ) -> None:
-    """Refuse times that go back where numbers of frames go on.
-
-    Raises:
-        ValueError: names the line.
-    """
+    """Refuse times that go back where numbers of frames go on."""
     good = np.isfinite(seconds) & np.isfinite(numbers)
     for every in _rows_of(told):
         rows = every[good[every]]
@@ -97,9 +90,6 @@ def require_told_apart(path: Path, seconds: Floats, at: Floats) -> None:
     """Refuse rows of nobody in particular of which several have each time and are at different places by turns.
 
     at: (N, 3 K) coordinates in the rows' order
-
-    Raises:
-        ValueError: says how many there are of each time.
     """
     if not np.isfinite(seconds).all():
         return

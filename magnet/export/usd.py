@@ -37,11 +37,7 @@ ROOT = "root"
 
 
 def require_usd() -> None:
-    """Refuse where usd-core is not installed.
-
-    Raises:
-        ImportError: says how to install it.
-    """
+    """Refuse where usd-core is not installed."""
     if importlib.util.find_spec("pxr") is None:
         raise ImportError(NEEDS)
 

@@ -224,11 +224,7 @@ def _frames(film: Film, report: Report, shown: Sequence[int] | None = None) -> I
 
 
 def require_av() -> None:
-    """Refuse where PyAV is not installed.
-
-    Raises:
-        ImportError: says how to install it.
-    """
+    """Refuse where PyAV is not installed."""
     if importlib.util.find_spec("av") is None:
         raise ImportError('.mp4 needs PyAV: pip install "magnet-motion[video]"; .gif and .webp do not')
 

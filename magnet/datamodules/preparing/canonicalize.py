@@ -167,9 +167,6 @@ def of_body(recording: Recording, body: Body, source: str, family: Family) -> Re
     """The recording if its shape numbers can be used with `body`.
 
     Where files may hold anything (`family` any), rotations of SMPL's family go with the open body in its mean shape.
-
-    Raises:
-        DataError: they are another body's.
     """
     if recording.poses is None or recording.body == body.id:
         return recording
@@ -304,9 +301,6 @@ def _stretches(valid: NDArray[np.bool_], cuts: list[int], flagged: list[str], le
     """Stretches of `least` frames or more between cuts where everybody is valid: first frame, and one past the last.
 
     valid: (T, P); cuts: frames that begin a stretch of their own; flagged: what was wrong, for messages
-
-    Raises:
-        DataError: there are none.
     """
     together: NDArray[np.bool_] = np.logical_and.reduce(valid, axis=1)
     frames = len(together)

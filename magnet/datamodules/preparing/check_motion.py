@@ -45,11 +45,7 @@ CONVERT = "convert the file, or take it as it was published"
 
 
 def usable(recording: Recording) -> Bools:
-    """The recording's valid frames, when its numbers can be used at all. -> (T, P)
-
-    Raises:
-        DataError: an impossible frame rate, no valid frame, or NaN where the frame is called valid.
-    """
+    """The recording's valid frames, when its numbers can be used at all. -> (T, P)"""
     fps = recording.fps
     if not (math.isfinite(fps) and 1.0 <= fps <= 1000.0):
         raise DataError(f"frame rate: got {fps}, expected 1 to 1000 frames a second; mend that number")
@@ -78,11 +74,7 @@ def usable(recording: Recording) -> Bools:
 
 
 def check_angles(poses: Array, valid: Bools, names: Sequence[str] = ()) -> None:
-    """Check that axis-angle vectors (T, P, 22, 3) are in radians.
-
-    Raises:
-        DataError: too many are longer than a full turn; says where the longest is.
-    """
+    """Check that axis-angle vectors (T, P, 22, 3) are in radians."""
     with np.errstate(all="ignore"):  # of frames that are not valid
         size = np.linalg.norm(np.asarray(poses, dtype=np.float64), axis=-1)
         size[np.abs(poses).max(axis=-1) > WILD_ANGLE] = 0.0  # what is no angle at all is another matter
@@ -122,9 +114,6 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
         joints: in the file's axes, metres or not; NaN where a joint is not known.
         valid: (T, P).
         chosen: the user gave the axis, perhaps because people lie down: only a clear contradiction is refused.
-
-    Raises:
-        DataError: another axis is the dominant one, or none is.
     """
     vector, what = up_vector(joints, valid)
     size = np.abs(vector)
@@ -145,11 +134,7 @@ def check_up(declared: Axis, joints: Array, valid: Bools, chosen: bool = False) 
 
 
 def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
-    """Check that translations are in metres, as bodies are. joints (T, P, 22, 3), pelvis (T, P, 3), y up
-
-    Raises:
-        DataError: people are too far from each other, from the floor or from where they were.
-    """
+    """Check that translations are in metres, as bodies are. joints (T, P, 22, 3), pelvis (T, P, 3), y up"""
     lowest = joints[:, :, WALKING[1:], 1].min(axis=-1)
     bob = float(np.ptp(np.percentile(lowest[valid], [5, 95])))
     here = pelvis[valid]
@@ -169,11 +154,7 @@ def check_lengths(joints: Array, pelvis: Array, valid: Bools) -> None:
 
 
 def check_apart(transl: Array, valid: Bools) -> None:
-    """Check that translations (T, P, 3) alone keep people apart, before their shapes move pelvises.
-
-    Raises:
-        DataError: they put everybody into one place.
-    """
+    """Check that translations (T, P, 3) alone keep people apart, before their shapes move pelvises."""
     apart = _apart(transl, valid)
     if apart == 0:
         raise DataError(
@@ -188,11 +169,7 @@ def check_apart(transl: Array, valid: Bools) -> None:
 
 
 def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
-    """Check that positions (T, P, M, 3) are in metres: trunks have a person's length.
-
-    Raises:
-        DataError: they have not, or hips and shoulders are not among the joints.
-    """
+    """Check that positions (T, P, M, 3) are in metres: trunks have a person's length."""
     place = {joint: i for i, joint in enumerate(joints)}
     if not {*HIPS, *SHOULDERS} <= set(place):
         raise DataError(
@@ -211,11 +188,7 @@ def check_limbs(points: Array, joints: Sequence[int], valid: Bools) -> None:
 
 
 def jumps(pelvis: Array, valid: Bools, fps: float) -> NDArray[np.intp]:
-    """Frames at which somebody jumps elsewhere. pelvis (T, P, 3) -> (number,) first frame after each jump
-
-    Raises:
-        DataError: there are so many that speeds themselves are wrong.
-    """
+    """Frames at which somebody jumps elsewhere. pelvis (T, P, 3) -> (number,) first frame after each jump"""
     step = np.linalg.norm(np.diff(pelvis, axis=0), axis=-1)
     both = valid[1:] & valid[:-1]
     far = (step > JUMP) & both
@@ -233,9 +206,6 @@ def check_rate(joints: Array, valid: Bools, declared: float, fps: float) -> None
 
     A rate that is too high shows in the pelvis, in drops faster than falling, and in short footsteps; one that is too
     low shows in long footsteps alone, where somebody walks.
-
-    Raises:
-        DataError: speeds, accelerations or the duration of footsteps are nobody's; or nothing moves at all.
     """
     together: Bools = np.logical_and.reduce(valid, axis=1)
     if together.sum() < 2 * fps:

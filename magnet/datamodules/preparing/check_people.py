@@ -69,11 +69,7 @@ def who(person: int, names: Sequence[str]) -> str:
 
 
 def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
-    """Check that shape numbers (P, 10) are possible.
-
-    Raises:
-        DataError: one is too far from the mean.
-    """
+    """Check that shape numbers (P, 10) are possible."""
     size = np.abs(betas).max(axis=1)
     if wrong := np.flatnonzero(~(size <= MOST_SHAPE)).tolist():
         listed = "; ".join(f"{who(p, names)}: {', '.join(f'{b:.3g}' for b in betas[p])}" for p in wrong)
@@ -84,11 +80,7 @@ def check_shapes(betas: Array, names: Sequence[str] = ()) -> None:
 
 
 def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
-    """Check that bodies at rest (P, 22, 3) have a possible size.
-
-    Raises:
-        DataError: one is not.
-    """
+    """Check that bodies at rest (P, 22, 3) have a possible size."""
     tall = rest[:, HEAD, 1] - rest[:, ANKLES, 1].mean(axis=1)
     for p in np.flatnonzero(~((tall >= STATURE[0]) & (tall <= STATURE[1]))).tolist():
         raise DataError(
@@ -101,11 +93,7 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
 
 
 def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
-    """Valid frames (T, P) without those whose numbers are no motion, and flags for the latter.
-
-    Raises:
-        DataError: nothing is left of somebody.
-    """
+    """Valid frames (T, P) without those whose numbers are no motion, and flags for the latter."""
     found: list[Flag] = []
     for mask, what in _nonsense(recording):
         for person in range(valid.shape[1]):
@@ -218,11 +206,7 @@ def jumps(quat: Array | None, joints: Array | None, valid: Bools, but: Sequence[
 
 
 def without(valid: Bools, flags: Sequence[Flag], names: Sequence[str], fps: float) -> Bools:
-    """(T, P) less the frames of flags that are cut out.
-
-    Raises:
-        DataError: nothing is left of somebody.
-    """
+    """(T, P) less the frames of flags that are cut out."""
     left = valid.copy()
     for flag in flags:
         if not flag.cut:

@@ -47,11 +47,7 @@ def families_of(kind: type[Reader]) -> tuple[str, ...]:
 
 
 def require_family(kind: type[Reader], body: Body, option: str, file: str) -> None:
-    """Refuse a body whose tree of joints is another family's: its shape numbers mean something else.
-
-    Raises:
-        ValueError: it is.
-    """
+    """Refuse a body whose tree of joints is another family's: its shape numbers mean something else."""
     families = families_of(kind)
     if not families or body.family in ("", *families) or body.id.startswith("open"):
         return

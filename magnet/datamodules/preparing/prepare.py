@@ -117,11 +117,7 @@ class TakeSelection:
 
 
 def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | None) -> TakeSelection:
-    """The takes to prepare; official lists are not looked at where `splits` are given.
-
-    Raises:
-        DataError: there are none, two of a name, or a group in two splits.
-    """
+    """The takes to prepare; official lists are not looked at where `splits` are given."""
     with named_errors(type(reader), f"its takes cannot be listed under {reader.root}"):
         takes = reader.takes() if splits is None else reader.found()
     if not takes:

@@ -26,11 +26,7 @@ CHANGING = 1e-4
 
 
 def open_npy(path: Path) -> NDArray:
-    """The array of an npy file without pickles.
-
-    Raises:
-        DataError: no such file, cut short, damaged, or it holds pickled objects.
-    """
+    """The array of an npy file without pickles."""
     with reported(path, "an npy file"), regular(path).open("rb") as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -51,10 +47,6 @@ def open_npz(path: Path, keys: Sequence[str], optional: Sequence[str] = ()) -> d
         path: the file.
         keys: what it must have.
         optional: what is read if it is there and holds no pickle.
-
-    Raises:
-        DataError: no such file, cut short, damaged, a key missing, pickled objects behind one, or an array that
-            would unpack to far more than the file holds.
     """
     with reported(path, "an npz archive"), load_npz(path, (*keys, *optional)) as file:
         require(path, file.files, keys)
@@ -68,21 +60,13 @@ def open_npz(path: Path, keys: Sequence[str], optional: Sequence[str] = ()) -> d
 
 
 def open_json(path: Path) -> Any:
-    """What a json file says.
-
-    Raises:
-        DataError: no such file, cut short or not json.
-    """
+    """What a json file says."""
     with reported(path, "a json file"):
         return json.loads(regular(path).read_bytes())
 
 
 def open_names(path: Path) -> list[str]:
-    """Names in a text file, one a line; empty lines are left out.
-
-    Raises:
-        DataError: no such file, or it is not text.
-    """
+    """Names in a text file, one a line; empty lines are left out."""
     with reported(path, "a list of names"):
         return [name for line in regular(path).read_text(encoding="utf-8-sig").splitlines() if (name := line.strip())]
 
@@ -107,11 +91,7 @@ def reported(path: Path, what: str) -> Iterator[None]:
 
 
 def require(where: object, there: Collection[Any], keys: Sequence[str]) -> None:
-    """Check that every key is there.
-
-    Raises:
-        DataError: names the missing ones and what is there.
-    """
+    """Check that every key is there."""
     if lacking := [key for key in keys if key not in there]:
         has = ", ".join(sorted(map(str, there))[:20]) or "nothing"
         raise DataError(f"{where}: lacks {', '.join(lacking)}; it has {has}; expected {', '.join(keys)}; {AGAIN}")
@@ -125,9 +105,6 @@ def floats(where: object, value: Any, shape: Sequence[int | str], finite: bool =
         value: an array or nested lists.
         shape: such as ("T", 3); equal words are equal lengths.
         finite: refuse NaN and infinity.
-
-    Raises:
-        DataError: no numbers, another shape, a length of zero, NaN or infinity.
     """
     wanted = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
     try:
@@ -155,11 +132,7 @@ def _fits(got: tuple[int, ...], shape: Sequence[int | str]) -> bool:
 
 
 def one_length(where: object, lengths: dict[str, int]) -> int:
-    """The number of frames that all parts of a take agree on.
-
-    Raises:
-        DataError: they do not; lists each.
-    """
+    """The number of frames that all parts of a take agree on."""
     if len(set(lengths.values())) != 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise DataError(f"{where}: unequal numbers of frames: {listed}; expected one length; {AGAIN}")
@@ -167,11 +140,7 @@ def one_length(where: object, lengths: dict[str, int]) -> int:
 
 
 def one_shape(where: object, betas: Doubles) -> tuple[Doubles, tuple[str, ...]]:
-    """Shape numbers of a person, who has one shape. (T, D) -> (10,) and a note if the file varies them
-
-    Raises:
-        DataError: fewer than ten numbers.
-    """
+    """Shape numbers of a person, who has one shape. (T, D) -> (10,) and a note if the file varies them"""
     if betas.shape[-1] < 10:
         raise DataError(f"{where}: {betas.shape[-1]} shape numbers, expected at least 10; {AGAIN}")
     spread = float(np.ptp(betas[:, :10], axis=0).max())
@@ -192,9 +161,6 @@ def listed_splits(files: Mapping[Split, Path], clean: Callable[[str], str] = str
     Args:
         files: one list a split; those that are not there are empty.
         clean: what to make of a line.
-
-    Raises:
-        DataError: a name is in two lists.
     """
     splits: dict[str, Split] = {}
     for split, path in files.items():

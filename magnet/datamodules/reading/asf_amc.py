@@ -316,11 +316,7 @@ def parse_amc(path: Path, skeleton: AsfSkeleton) -> Floats:
 
 
 def together(recordings: Sequence[AmcRecording], trim: bool = False) -> list[AmcRecording]:
-    """Recordings of people captured together, which must be equally long; `trim` cuts them to the shortest.
-
-    Raises:
-        DataError: lengths or frame rates differ.
-    """
+    """Recordings of people captured together, which must be equally long; `trim` cuts them to the shortest."""
     first = recordings[0]
     for other in recordings[1:]:
         if other.fps != first.fps:

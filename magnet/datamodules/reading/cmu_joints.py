@@ -222,11 +222,7 @@ class CMUHints:
 
 
 def measured(recordings: Sequence[AmcRecording], trim: bool = False) -> tuple[Recording, tuple[Glitches, ...]]:
-    """People captured together as joints at 30 fps, with hints for the fit; and what was mended on the way.
-
-    Raises:
-        ValueError: lengths differ.
-    """
+    """People captured together as joints at 30 fps, with hints for the fit; and what was mended on the way."""
     recordings = together(recordings, trim)
     mended, glitches = zip(*(repaired(recording) for recording in recordings), strict=True)
     resampled = tuple(recording.resampled(FPS) for recording in mended)
@@ -278,13 +274,10 @@ def touching(targets: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def check_rate(recording: AmcRecording) -> None:
-    """Whether people move like that: the frame rate is not in the file, and a wrong one shows in speeds.
+    """Refuse a frame rate at which nobody could move so: it is not in the file, and a wrong one shows in speeds.
 
     A rate that is wrong by two shows only where somebody jumps or falls, and then gives a warning: 143_35, called
     120 fps, was found so.
-
-    Raises:
-        ValueError: speeds that no person reaches, or nobody moves at all.
     """
     if recording.frames < recording.fps:
         return  # too short to say

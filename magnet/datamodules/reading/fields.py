@@ -33,20 +33,12 @@ class PersonMotion:
 
 
 def pickled_mapping(path: Path) -> Mapping[str, Any]:
-    """The dict with text keys that a .pkl holds, or an .npy as its one object. No code in it is run.
-
-    Raises:
-        DataError: no such file, damaged, or it holds something else.
-    """
+    """The dict with text keys that a .pkl holds, or an .npy as its one object. No code in it is run."""
     return mapping(path, load_pickle(path) if path.suffix == ".pkl" else load_object_npy(path))
 
 
 def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Doubles:
-    """A key's value as so many numbers a frame, however a frame is shaped. -> (T, width)
-
-    Raises:
-        DataError: no such key, no frames, another width, or NaN.
-    """
+    """A key's value as so many numbers a frame, however a frame is shaped. -> (T, width)"""
     require(where, held, (key,))
     value = held[key]
     if isinstance(value, np.ndarray) and value.ndim > 2 and math.prod(value.shape[1:]) == width:
@@ -55,11 +47,7 @@ def rows(where: object, held: Mapping[str, Any], key: str, width: int) -> Double
 
 
 def shape_numbers(where: object, held: Mapping[str, Any]) -> tuple[Doubles, tuple[str, ...]]:
-    """A person's first ten shape numbers from `betas` (10+,), (1, 10+) or (T, 10+). -> (10,), notes
-
-    Raises:
-        DataError: no such key, another shape, or NaN.
-    """
+    """A person's first ten shape numbers from `betas` (10+,), (1, 10+) or (T, 10+). -> (10,), notes"""
     require(where, held, ("betas",))
     value = held["betas"]
     if isinstance(value, np.ndarray) and value.ndim == 1:
@@ -88,9 +76,6 @@ def person(
 
     gender: of the body that the shape is of, as the data set says it
     orient, body, transl: keys of the root, the joints and the translation
-
-    Raises:
-        DataError: a key is missing, has another shape or holds NaN, or their lengths differ.
     """
     require(where, held, (orient, body, transl, "betas"))
     parts = {key: rows(where, held, key, width) for key, width in ((orient, 3), (body, 63), (transl, 3))}
@@ -106,9 +91,6 @@ def side_by_side(
     """People who were recorded together, in the order of agents, as one recording.
 
     cut: unequal lengths to the shortest, with a note beside what else was found (`notes`)
-
-    Raises:
-        DataError: unequal lengths.
     """
     lengths, said = {someone.name: someone.frames for someone in people}, list(notes)
     if not cut:

@@ -241,11 +241,7 @@ class OwnReader(Reader, Generic[T]):
         return self.recording(group.scene, tracks, names, notes)
 
     def part_of(self, take: Take) -> PartOf:
-        """Which part of which scene a take is, and how long both are.
-
-        Raises:
-            DataError: a file of it that cannot be read.
-        """
+        """Which part of which scene a take is, and how long both are."""
         group, part = self._meant(take)
         tracks, _, _ = self._people(group)
         frames, fps = min(track.frames for track in tracks), tracks[0].fps
@@ -299,9 +295,6 @@ def require_alone(path: Path, people: int, alone: bool) -> None:
         path: the file.
         people: how many it holds.
         alone: it is the only one of its scene.
-
-    Raises:
-        DataError: it is not.
     """
     if people > 1 and not alone:
         raise DataError(

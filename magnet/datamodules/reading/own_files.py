@@ -94,9 +94,6 @@ def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
     """Files whose names differ in the last word alone, such as dance_A and dance_B; in a folder, A and B alone.
 
     Everybody else is alone in a scene.
-
-    Raises:
-        DataError: two files are of one person of a scene.
     """
     told = [_told(root, path) for path in files]
     members = Counter(scene for scene, person, _ in told if person)
@@ -117,11 +114,7 @@ def by_names(root: Path, files: Iterable[Path]) -> list[SceneFiles]:
 
 
 def _require_names_once(together: Mapping[str, Sequence[PersonFile]], advice: str) -> None:
-    """Refuse a scene with two files of one person, who would be two people.
-
-    Raises:
-        DataError: names the scene, the person and both files.
-    """
+    """Refuse a scene with two files of one person, who would be two people."""
     for scene, people in together.items():
         seen: dict[str, Path] = {}
         for each in people:

@@ -58,11 +58,7 @@ class BvhSkeleton:
 
 
 def read_bvh_header(path: Path) -> BvhSkeleton:
-    """Read a BVH file's hierarchy; of its motion, only that all frames are there.
-
-    Raises:
-        DataError: no such file, no BVH, or cut short; names the line.
-    """
+    """Read a BVH file's hierarchy; of its motion, only that all frames are there."""
     lines = contents(path).decode("latin-1").removeprefix("\xef\xbb\xbf").splitlines()
     try:
         said = bvh_header(lines, path)
@@ -101,9 +97,6 @@ def track(folder: Path, scale: float) -> tuple[Doubles, float, list[str]]:
 
     folder: one person's, with motion.bvh, csv files of positions and rotations and motion_offsets.pkl
     scale: metres a unit
-
-    Raises:
-        DataError: a file is missing or damaged, they do not belong together, or joints and units cannot be right.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder: a partner's files are missing; {AGAIN}")
@@ -200,11 +193,7 @@ def _misfit(header: BvhSkeleton, table: _Table) -> float:
 
 
 def _proof(folder: Path, header: BvhSkeleton, table: _Table, scale: float) -> str:
-    """Find the Euler order with which rotations and offsets give the positions.
-
-    Raises:
-        DataError: none leads there within 1 cm.
-    """
+    """Find the Euler order with which rotations and offsets give the positions."""
     paths = sorted(folder.glob("*rotation*.csv"))
     if not paths:
         return "no csv of rotations: joints and units are not proven"

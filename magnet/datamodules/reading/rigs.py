@@ -79,11 +79,7 @@ class RigTrack:
 
 
 def _skeletons(tracks: Sequence[RigTrack], up: str | None = None) -> list[Skeleton]:
-    """Skeletons of one scene in metres, y up; the up axis is `up`, or what the format says, or found from the files.
-
-    Raises:
-        DataError: names, legs or the rest pose do not tell.
-    """
+    """Skeletons of one scene in metres, y up; the up axis is `up`, or what the format says, or found from the files."""
     prescribed = {track.file.up for track in tracks}
     up = up or (prescribed.pop() if len(prescribed) == 1 else None)
     try:

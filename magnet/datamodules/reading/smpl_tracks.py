@@ -84,9 +84,6 @@ def on_one_clock(
 
     Returns:
         The people, and what should be known of them.
-
-    Raises:
-        DataError: only some have numbers, or they share no frame.
     """
     clock = shared_clock(where, [track.numbers for track in tracks], names)
     if clock is None:
@@ -114,9 +111,6 @@ def of_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tup
 
     Returns:
         The people, and what should be known of them.
-
-    Raises:
-        DataError: only some have numbers, they share no frame, or they begin with different ones at different rates.
     """
     if any(track.said_fps not in (None, track.fps) for track in tracks):
         begun = {file.name: track.first for file, track in zip(files, tracks, strict=True)}

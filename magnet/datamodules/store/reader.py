@@ -249,11 +249,7 @@ class StoreReader:
             raise StoreError(f"{self.path / MANIFEST}: damaged ({error}); prepare the store again") from error
 
     def require_roles(self, roles: Sequence[str]) -> None:
-        """Refuse a role that nobody in the store has.
-
-        Raises:
-            ValueError: names it, and some that people have.
-        """
+        """Refuse a role that nobody in the store has."""
         named = {name for entry in self.manifest.get("persons", []) for name in entry["persons"]}
         had = {word for name in named for word in _words(name)}
         for role in roles:
