@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from magnet.body import Body
-    from magnet.export.reading import Read, Reading
+    from magnet.export.read_options import Reading
+    from magnet.export.reading import Read
     from magnet.motion.scene import Scene
 
 EPILOG = """\

@@ -16,7 +16,8 @@ from magnet.cli.named_files import READ, require_there
 if TYPE_CHECKING:
     from magnet.denoiser.core import DenoiserCore
     from magnet.export.drawing import Size
-    from magnet.export.reading import Read, Reading
+    from magnet.export.read_options import Reading
+    from magnet.export.reading import Read
     from magnet.motion.scene import Scene
 
 Options = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -108,7 +109,7 @@ def add_origin(options: Options) -> None:
 
 def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
     """What `add_body` and `add_origin` were given, as readers take it; not every command knows --trim."""
-    from magnet.export.reading import Reading
+    from magnet.export.read_options import Reading
 
     return Reading(
         fps=fps,

@@ -16,7 +16,7 @@ from magnet.errors import counted
 from magnet.sampling.presets import PRESETS, preset_name
 
 if TYPE_CHECKING:
-    from magnet.export.reading import Reading
+    from magnet.export.read_options import Reading
 
 GOES_WITH = {
     **dict.fromkeys(("ckpt_path", "task", "sampler", "steps", "seed"), "--live or --record"),

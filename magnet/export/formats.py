@@ -21,6 +21,7 @@ from magnet.export.npz import each_of, save_smplx
 from magnet.export.onto_rig import RigOptions, save_onto
 from magnet.export.page.html import save_html
 from magnet.export.picture import contact_sheet
+from magnet.export.read_options import MOST_FPS
 from magnet.export.usd import require_usd, save_usd
 from magnet.export.video import PICTURES, Report, render_video, require_av
 from magnet.export.vrma import save_vrma
@@ -32,8 +33,6 @@ FILM = (640, 480)
 """Pixels of a film's panel."""
 MOST_PEOPLE = 1000
 """Numbers of people that are looked for beside a file of somebody."""
-MOST_FPS = 1000.0
-"""Frames a second that are written at most; more is a slip, and would fill the memory."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from magnet.export.cutting import Begin, kept_frames
 from magnet.export.joints_table import SLOW, JointTable, read_table
 from magnet.export.naming import recognised
 from magnet.export.npz import require_own_rate
+from magnet.export.read_options import Reading
 from magnet.export.retarget import POOR_FIT, REFUSED_FIT, TARGETS
 from magnet.export.rig import LONGEST_LEG, SHORTEST_LEG, UNITS, UP, require_unit, require_up
 from magnet.export.rig_motion import Bools, Floats
@@ -36,46 +37,32 @@ UPRIGHT, CLEAR = 0.5, 0.8
 """Cosine between torsos and the axis that is said to be up, below which it is doubted; and from which one is found."""
 
 
-def load_joints(
-    path: str | Path,
-    body: Body,
-    *,
-    unit: str | None = None,
-    up: str | None = None,
-    joints: Mapping[str, str] | None = None,
-    fps: float | None = None,
-    start: int = 0,
-    end: int | None = None,
-) -> tuple[Scene, str, bool, Begin]:
+def load_joints(path: str | Path, body: Body, options: Reading) -> tuple[Scene, str, bool, Begin]:
     """The people of a table on a body, fitted to their joints; a note on how it was read; whether it is one of ours;
     and when it begins.
 
     Frames in which somebody's hips or shoulders are missing are not valid; other joints may be missing now and then.
-
-    Args:
-        unit, up, joints: as `magnet.export.reading.Reading` has them; up is found from where torsos point.
-        fps: the table's frames a second, or of its count of frames, if it says no time, or too few of them; of one
-            frame `FPS`, too.
-        start, end: the frames that are kept, from 0, without `end`; None: to the last.
+    Up is found from where torsos point. The options' `in_fps` is the rate of the table, or of its count of frames, if
+    it says no time, or too few of them; of one frame it is `FPS`, too.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: as `read_table`, unknown joints, no unit, no rate, another rate than the times', nobody, or no fit.
     """
     path, table = Path(path), read_table(path)
-    rate, doubts = _rate(path, table, fps)
-    require_up(up)
-    found, weight, scheme = _joints(path, table, joints)
+    rate, doubts = _rate(path, table, options.in_fps)
+    require_up(options.up)
+    found, weight, scheme = _joints(path, table, options.joints)
     used = sorted(weight)
-    kept = kept_frames(path, len(table.at), start, end)
+    kept = kept_frames(path, len(table.at), options.start, options.end)
     at = table.at[kept][:, :, [found[j] for j in used]]
-    name, notes = _unit(path, at, used, unit or table.unit)
+    name, notes = _unit(path, at, used, options.unit or table.unit)
     sure = np.asarray(np.isfinite(at).all(axis=-1))  # (T, P, M)
     valid = np.asarray(sure[:, :, [used.index(j) for j in (*HIPS, *SHOULDERS)]].all(axis=-1))
     for person, there in zip(table.people, valid.T, strict=True):
         if not there.any():
             raise ValueError(f"{path}: {person or 'the person'} has hips and shoulders in no frame")
-    up, notes_up = _up(at[valid], used, up)
+    up, notes_up = _up(at[valid], used, options.up)
     doubts += [*notes_up, *_untracked(table.people, used, sure), *_mirrored(at[valid], used)]
     weights = np.array([weight[j] for j in used]) * np.where(sure, 1.0, BRIDGED * sure.any(axis=0))
     fit = _fitted(path, UNITS[name] * _bridged(at @ UP[up].T, sure), used, weights, valid, rate, body)

@@ -15,6 +15,7 @@ import torch
 from magnet.body import Body
 from magnet.export.cutting import kept_frames, require_one_clock
 from magnet.export.npz import clear_axes, is_open, read_smplx, require_own_rate, scene_of, stance_in, unit_against
+from magnet.export.read_options import Reading
 from magnet.export.rig import UP
 from magnet.export.smpl_clock import FRAMES, Numbers, SharedClock, frame_numbers, require_one_beginning, shared_clock
 from magnet.export.smpl_keys import posed
@@ -63,15 +64,7 @@ def _ours(keys: set[str]) -> bool:
     return "meta" in keys and not posed(keys)
 
 
-def read_people(
-    files: Sequence[Path],
-    body: Body,
-    up: str | None,
-    unit: str | None,
-    in_fps: float | None,
-    start: int = 0,
-    end: int | None = None,
-) -> list[NpzFile]:
+def read_people(files: Sequence[Path], body: Body, options: Reading) -> list[NpzFile]:
     """Read the npz and pkl files of one scene, other programs' with the axis that suits them together.
 
     People whose frames are numbered are laid on each other by these, as `magnet data prepare` does; frames in which
@@ -79,8 +72,6 @@ def read_people(
 
     Args:
         files: one for each person, or one for all.
-        body, up, unit, in_fps: as in `magnet.export.npz.read_smplx`.
-        start, end: the frames that are read, from 0, without `end`; None: to the last.
 
     Returns:
         Of each file everybody, or, where a pkl holds people by name, each of them.
@@ -89,8 +80,8 @@ def read_people(
         ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts; no such
             frames, or numbers of frames that do not go together.
     """
-    alone = len(files) == 1
-    people = [one for file in files for one in _read(file, body, up, unit, in_fps, alone)]
+    up, unit, start, end = options.up, options.unit, options.start, options.end
+    people = [one for file in files for one in _read(file, body, options, alone=len(files) == 1)]
     if up is None and len(people) > 1:
         people = _of_one_axis(people, body)
     warned = told_against(up, [axis for one in people for axis in clear_axes(one.scene, up)]) if up else []
@@ -166,14 +157,13 @@ def _of_one_axis(people: Sequence[NpzFile], body: Body) -> list[NpzFile]:
     ]
 
 
-def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None, alone: bool) -> list[NpzFile]:
+def _read(path: Path, body: Body, options: Reading, alone: bool) -> list[NpzFile]:
     """What a file holds, and how it was read. alone: no other file is of the scene"""
+    how = (options.up, options.unit, options.in_fps)
     if path.suffix.lower() == PICKLE:
         there = list(people_in(path, load_pickle(path)))
-        read = [
-            _foreign(path, where, one, scene_of(where, one, body, up, unit, in_fps), body, up) for where, one in there
-        ]
-        if up is None:
+        read = [_foreign(path, where, one, scene_of(where, one, body, *how), body, options.up) for where, one in there]
+        if options.up is None:
             read = _of_one_world(read)
         return [_numbered(one, held, alone and len(there) == 1) for one, (_, held) in zip(read, there, strict=True)]
     if not zipfile.is_zipfile(path):
@@ -184,8 +174,8 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
     except Exception as error:  # a damaged archive may raise anything
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     if _ours(keys):
-        return [_own(path, body, up, unit, in_fps)]
-    one = _foreign(path, str(path), keys, read_smplx(path, body, up, unit, in_fps), body, up)
+        return [_own(path, body, options)]
+    one = _foreign(path, str(path), keys, read_smplx(path, body, *how), body, options.up)
     held = {}
     if FRAMES in keys:
         with load_npz(path) as file, contextlib.suppress(ValueError):  # pickled, such as names of pictures
@@ -193,14 +183,17 @@ def _read(path: Path, body: Body, up: str | None, unit: str | None, in_fps: floa
     return [_numbered(one, held, alone)]
 
 
-def _own(path: Path, body: Body, up: str | None, unit: str | None, in_fps: float | None) -> NpzFile:
+def _own(path: Path, body: Body, options: Reading) -> NpzFile:
     """A scene as we save it."""
-    if up not in (None, "y"):
-        raise ValueError(f"{path}: up axis {up!r} is for other programs' files; in a scene of magnet y points up")
-    if unit not in (None, "m"):
-        raise ValueError(f"{path}: unit {unit!r} is for other programs' files; lengths of a scene of magnet are metres")
+    if options.up not in (None, "y"):
+        raise ValueError(
+            f"{path}: up axis {options.up!r} is for other programs' files; in a scene of magnet y points up"
+        )
+    if options.unit not in (None, "m"):
+        unit = f"unit {options.unit!r} is for other programs' files"
+        raise ValueError(f"{path}: {unit}; lengths of a scene of magnet are metres")
     scene = Scene.load(path)
-    require_own_rate(path, scene.fps, in_fps)
+    require_own_rate(path, scene.fps, options.in_fps)
     if scene.body != body.id:
         raise ValueError(
             f"{path}: its shapes belong to body {scene.body!r}, not {body.id!r}; give its file: --body FILE"

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from magnet.body import Body, load_body, on_floor
 from magnet.body.floor import counting, level, lowest, off_their_floor, standing
 from magnet.body.joints import HIPS
-from magnet.checks import require_flag, require_number, require_whole
 from magnet.export.cutting import rates_note, shared_frames, together
-from magnet.export.formats import MOST_FPS, WRITTEN
+from magnet.export.formats import WRITTEN
 from magnet.export.gltf_file import GLTF
 from magnet.export.joints_read import load_joints
 from magnet.export.npz_files import PICKLE, is_ours, read_people
+from magnet.export.read_options import Reading
 from magnet.export.retarget import load_rigs
 from magnet.export.rig_files import RIGS
 from magnet.export.unread import advice_for
@@ -44,49 +43,6 @@ class Read:
     scene: Scene
     body: Body
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Options for reading what files do not state.
-
-    Args:
-        fps: resample to this rate; None: as recorded.
-        trim: cut people of different lengths to the shortest.
-        unit: of lengths; None: of npz and pkl metres, else by the length of legs.
-        up: axis of the file that points up; None: found.
-        joints: for all but npz and pkl: our joint's name to the file's, if no naming scheme fits.
-        keep_floor: keep people of other programs' files at the height they were recorded at.
-        in_fps: frames a second of npz, pkl and csv files that do not say it.
-        start, end: the frames of each file that are read, at its own rate, from 0, without `end`; None: to the last.
-        clip: the animation of GLB files that is read, by its name; None: the first that moves somebody.
-    """
-
-    fps: float | None = None
-    trim: bool = False
-    unit: str | None = None
-    up: str | None = None
-    joints: Mapping[str, str] = field(default_factory=dict)
-    keep_floor: bool = False
-    in_fps: float | None = None
-    start: int = 0
-    end: int | None = None
-    clip: str | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("fps", "in_fps"):
-            if getattr(self, name) is not None:
-                require_number(name, getattr(self, name), over=0, most=MOST_FPS)
-        for name in ("unit", "up", "clip"):
-            if not isinstance(getattr(self, name), str | None):
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a word, or None")
-        for name in ("trim", "keep_floor"):
-            require_flag(name, getattr(self, name))
-        require_whole("start", self.start)
-        if self.end is not None:
-            require_whole("end", self.end)
-        if not isinstance(self.joints, Mapping):
-            raise ValueError(f"joints: got {self.joints!r}, expected names by ours, such as {{'left_hip': 'Thigh_L'}}")
 
 
 def read(
@@ -122,8 +78,7 @@ def read(
         if options.in_fps is not None:
             said = f"a {min(suffixes)} says its own, --fps resamples"
             raise ValueError(f"in_fps: is for {', '.join((*ARRAYS, TABLE))} files that say no frame rate; {said}")
-        told = {name: value for name, value in vars(options).items() if name != "in_fps"}
-        imported = load_rigs(files, body, **told)
+        imported = load_rigs(files, body, options)
         notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
         if abs(imported.floor) >= UNSEEN:
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
@@ -136,7 +91,7 @@ def read(
     if options.joints:
         kinds = ", ".join((*RIGS, TABLE))
         raise ValueError(f"{files[0]}: joint: is for {kinds}; in arrays joints are where SMPL-X has them")
-    people = read_people(files, body, options.up, options.unit, options.in_fps, options.start, options.end)
+    people = read_people(files, body, options)
     scenes, foreign = [one.scene for one in people], [one.foreign for one in people]
     notes = list(dict.fromkeys(note for one in people for note in one.notes))  # people of one file share some
     if len(people) == 1:
@@ -154,9 +109,7 @@ def read(
 
 def _from_tables(files: Sequence[Path], body: Body, options: Reading) -> Read:
     """People by the positions of their joints, on a body and on the floor."""
-    how: dict[str, Any] = {"unit": options.unit, "up": options.up, "joints": options.joints, "fps": options.in_fps}
-    how |= {"start": options.start, "end": options.end}
-    read_so = [load_joints(file, body, **how) for file in files]
+    read_so = [load_joints(file, body, options) for file in files]
     scenes, notes = [scene for scene, *_ in read_so], [note for _, note, *_ in read_so]
     rates = [scene.fps for scene in scenes]
     parts, cut = shared_frames(files, [scene.frames for scene in scenes], rates, [begin for *_, begin in read_so])

@@ -23,6 +23,7 @@ from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock, together
+from magnet.export.read_options import Reading
 from magnet.export.rig import LIMBS, Skeleton, people_of, require_unit, require_up, understood_together
 from magnet.export.rig_files import read_rigs
 from magnet.export.rig_motion import RigMotion
@@ -106,36 +107,13 @@ class Imported:
     rates: tuple[float, ...] = ()  # frames a second of each file
 
 
-def load_rigs(
-    paths: str | Path | Sequence[str | Path],
-    body: Body,
-    *,
-    fps: float | None = None,
-    trim: bool = False,
-    unit: str | None = None,
-    up: str | None = None,
-    joints: Mapping[str, str] | None = None,
-    keep_floor: bool = False,
-    start: int = 0,
-    end: int | None = None,
-    clip: str | None = None,
-) -> Imported:
+def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, options: Reading = Reading()) -> Imported:
     """Read BVH, glTF, VRM or FBX files, of one person or several: our own, or any skeleton with known joint names.
 
     A skeleton that is the body's own is restored exactly; any other is fitted: limbs to positions, all else to
-    rotations relative to the file's rest pose, which may be a T or an A pose.
-
-    Args:
-        fps: resample all files to this rate; None: the files' own rate, which must agree.
-        trim: cut files of different lengths to the shortest.
-        unit: one of `m`, `cm`, `mm`, `inch`, `foot`; None: found from the length of the legs, the same for all files
-            if one suits them all.
-        up: `y`, `z`, `-y` ...; None: y of glTF and FBX, as their formats say, else found from where torsos point, and
-            rest poses where somebody lies.
-        joints: our joint's name to theirs, for names that no scheme knows.
-        keep_floor: keep fitted people at the height they were recorded at.
-        start, end: the frames of each file that are read, at its own rate, from 0 and without `end`; None: to the last.
-        clip: the animation of glTF files that is read, by its name; None: the first.
+    rotations relative to the file's rest pose, which may be a T or an A pose. One unit is found for all files where it
+    suits them all. The up axis is y of glTF and FBX, as their formats say, else found from where torsos point, and from
+    rest poses where somebody lies.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -146,28 +124,30 @@ def load_rigs(
     each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not each:
         raise ValueError("no files given")
-    require_up(up)
-    require_unit(unit)
-    files = [rig for path in each for rig in people_of(read_rigs(path, start, end, clip), joints)]
+    require_up(options.up)
+    require_unit(options.unit)
+    start, end = options.start, options.end
+    files = [rig for path in each for rig in people_of(read_rigs(path, start, end, options.clip), options.joints)]
     require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
     rates = {file.fps for file in files}
-    if len(rates) > 1 and fps is None:
+    if len(rates) > 1 and options.fps is None:
         found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
         raise ValueError(
             f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
         )
     prescribed = {file.up for file in files}  # where all are of formats that say it
-    up = up or (prescribed.pop() if len(prescribed) == 1 else None)
+    up = options.up or (prescribed.pop() if len(prescribed) == 1 else None)
     for file in files:
         file.require_near()
-    skeletons = understood_together(files, unit, up, joints)
+    skeletons = understood_together(files, options.unit, up, options.joints)
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
-    sources = tuple(replace(how, jumps=found) for (_, how), found in zip(read, jumps, strict=True))
+    sources = tuple(replace(source, jumps=found) for (_, source), found in zip(read, jumps, strict=True))
     people = [_tracked(one, file) for (one, _), file in zip(read, files, strict=True)]
-    scene = together(people, [f"{file.path} {file.person}".rstrip() for file in files], fps=fps, trim=trim)
+    names = [f"{file.path} {file.person}".rstrip() for file in files]
+    scene = together(people, names, fps=options.fps, trim=options.trim)
     floor = 0.0
-    if not keep_floor and not all(source.exact for _, source in read):
+    if not options.keep_floor and not all(source.exact for _, source in read):
         floor = float(floor_height(body.joints(scene)[0], body, scene.betas[0]).amin(dim=-1).median())
         T_world_root = scene.T_world_root.clone()
         T_world_root[..., 1, 3] -= floor

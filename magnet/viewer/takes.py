@@ -10,7 +10,8 @@ from pathlib import Path
 
 from magnet.body.base import Body, load_body
 from magnet.export.page.takes import SAMPLES, ShownTake, take, takes
-from magnet.export.reading import Reading, read, shared
+from magnet.export.read_options import Reading
+from magnet.export.reading import read, shared
 from magnet.export.trace import DenoisingTrace
 from magnet.files import DAMAGED, load_npz
 from magnet.motion.scene import Scene

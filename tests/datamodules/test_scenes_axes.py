@@ -17,6 +17,7 @@ from magnet.datamodules.preparing.canonicalize import Canonicalized, Canonicaliz
 from magnet.datamodules.reading.recording import Axis, DataError, Recording
 from magnet.datamodules.scenes import ScenesReader
 from magnet.export.npz_files import read_people
+from magnet.export.read_options import Reading
 from magnet.export.rig import UP
 from magnet.export.smpl_keys import SMPLX_PELVIS
 
@@ -74,7 +75,7 @@ def test_who_lies_beside_somebody_of_the_same_axis_has_that_axis(tmp_path: Path)
     found = read(tmp_path)
     assert (found.up, found.ups) == ("+z", ())
     assert any("walk_B.npz: torsos point along" in note and "this person lies" in note for note in found.notes)
-    assert [one.up for one in read_people(files, BODY, None, None, None)] == ["z", "z"]
+    assert [one.up for one in read_people(files, BODY, Reading())] == ["z", "z"]
 
 
 def test_the_whole_files_tell_the_axes_of_a_part(tmp_path: Path) -> None:

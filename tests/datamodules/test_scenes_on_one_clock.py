@@ -14,7 +14,7 @@ from magnet.datamodules.fakes.motion import people
 from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.datamodules.scenes import ScenesReader
 from magnet.export.npz import read_smplx
-from magnet.export.reading import Reading
+from magnet.export.read_options import Reading
 from magnet.export.reading import read as read_scene
 from tests.datamodules.readers import world_joints
 

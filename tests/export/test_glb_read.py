@@ -20,7 +20,8 @@ from magnet.export import formats, save_glb
 from magnet.export.bones import BoneOptions
 from magnet.export.glb_read import read_glb
 from magnet.export.gltf_file import sampled
-from magnet.export.reading import Reading, read
+from magnet.export.read_options import Reading
+from magnet.export.reading import read
 from magnet.motion.scene import Scene, cat_agents
 from tests.export import glb_strangers
 from tests.export.strangers import NAMINGS

@@ -19,7 +19,8 @@ from magnet.export import formats, save_glb
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.gltf_file import GltfFile
 from magnet.export.onto_rig import save_onto
-from magnet.export.reading import Reading, read
+from magnet.export.read_options import Reading
+from magnet.export.reading import read
 from magnet.motion.rotations import from_quat
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene

@@ -15,7 +15,8 @@ from magnet.body import Body
 from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_csv
 from magnet.export.cutting import Begin, shared_frames
-from magnet.export.reading import Reading, read
+from magnet.export.read_options import Reading
+from magnet.export.reading import read
 from magnet.motion.scene import Scene
 
 COCO = [

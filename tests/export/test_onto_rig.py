@@ -18,7 +18,8 @@ from magnet.export.bvh_read import read_bvh
 from magnet.export.glb_read import read_glb
 from magnet.export.gltf_file import GltfFile
 from magnet.export.onto_rig import save_onto
-from magnet.export.reading import Reading, read
+from magnet.export.read_options import Reading
+from magnet.export.reading import read
 from magnet.motion.scene import Scene
 from tests.export import glb_strangers, strangers
 from tests.export.test_glb_read import Z_UP_CENTIMETRES, stranger

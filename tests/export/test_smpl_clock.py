@@ -16,7 +16,8 @@ from magnet.datamodules import registry
 from magnet.datamodules.scenes import ScenesReader
 from magnet.errors import DataError
 from magnet.export.bvh import save_bvh
-from magnet.export.reading import Read, Reading, read
+from magnet.export.read_options import Reading
+from magnet.export.reading import Read, read
 from magnet.export.smpl_clock import frame_numbers, shared_clock
 from magnet.motion.scene import Scene
 from tests.datamodules.test_scenes_on_one_clock import TRUE, seen

@@ -11,7 +11,7 @@ from magnet.body import Body
 from magnet.export.formats import write
 from magnet.export.npz import save_smplx
 from magnet.export.page.takes import numbered, same_length, take, takes
-from magnet.export.reading import Reading
+from magnet.export.read_options import Reading
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
