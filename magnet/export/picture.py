@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -79,14 +80,9 @@ def contact_sheet(
     return path
 
 
-def _broken(label: str, wide: int = 16) -> str:
-    """A label in lines of at most `wide` letters, where its words allow."""
-    lines: list[str] = [""]
-    for word in label.split():
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > wide:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
+def _broken(label: str) -> str:
+    """A label in lines of at most 16 letters, where its words allow."""
+    return textwrap.fill(" ".join(label.split()), 16, break_long_words=False, break_on_hyphens=False)
 
 
 def _label_width(labels: list[str], size: float) -> float:

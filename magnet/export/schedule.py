@@ -243,14 +243,7 @@ def _box(
     level = int(moment.level[token, agent])
     unit = plan.unit
     if moment.empty[token, agent]:
-        clean = level < LEVELS
-        if not plan.fine:
-            draw.rectangle(box, fill=_faint(own, clean))
-            return
-        _dashed(draw, box, [DASH], unit)
-        if clean:
-            x, y, r = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2, 2.2 * unit
-            draw.ellipse((x - r, y - r, x + r, y + r), fill=mix(own, 0.75))
+        _unavailable(draw, box, own, level < LEVELS, plan)
         return
     if not plan.fine:
         draw.rectangle(box, fill=shade(own, level))
@@ -262,9 +255,17 @@ def _box(
         _dashed(draw, box, viewers, 2 * unit)
 
 
-def _faint(own: Colour, clean: bool) -> Colour:
-    """A box that is not seen, where it is too small for dashes."""
-    return mix(own, 0.35, (214, 218, 226)) if clean else (244, 245, 248)
+def _unavailable(
+    draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], own: Colour, clean: bool, plan: Layout
+) -> None:
+    """A token that no agent sees that is being updated, with a dot where it is clean."""
+    if not plan.fine:
+        draw.rectangle(box, fill=mix(own, 0.35, (214, 218, 226)) if clean else (244, 245, 248))
+        return
+    _dashed(draw, box, [DASH], plan.unit)
+    if clean:
+        x, y, r = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2, 2.2 * plan.unit
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=mix(own, 0.75))
 
 
 def _dashed(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], colours: Sequence[Colour], width: int) -> None:
@@ -332,13 +333,8 @@ def _key(draw: ImageDraw.ImageDraw, keys: list[Key], y: int, plan: Layout) -> No
                 draw.rounded_rectangle(small, radius=2 * unit, fill=fill, outline=edge, width=unit)
         elif kind == "window":
             draw.rounded_rectangle(box, radius=4 * unit, outline=WINDOW, width=unit)
-        elif kind in ("empty", "done") and not plan.fine:
-            draw.rectangle(box, fill=_faint(AGENTS[0], kind == "done"))
         elif kind in ("empty", "done"):
-            _dashed(draw, box, [DASH], unit)
-            if kind == "done":
-                middle, high, r = x + 10 * unit, y + 5.5 * unit, 2.2 * unit
-                draw.ellipse((middle - r, high - r, middle + r, high + r), fill=mix(AGENTS[0], 0.75))
+            _unavailable(draw, box, AGENTS[0], kind == "done", plan)
         else:
             fill = GIVEN if kind == "given" else shade(AGENTS[0], LEVELS // 3)
             draw.rounded_rectangle(box, radius=2 * unit, fill=fill)
