@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magnet.export.naming import recognised
 from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
 from magnet.export.table_times import (
+    TableRows,
     frames_by_time,
     require_one_recording,
     require_times_with_frames,
@@ -90,18 +91,19 @@ def read_table(path: str | Path) -> JointTable:
     people = tuple(dict.fromkeys(told))
     if len(people) > MOST_PEOPLE:
         raise ValueError(f"{path}: its column {head[person_at or 0]} names {len(people)} people; is it a row's number?")
-    seconds, told_in = (None, "") if time_at is None else _seconds(numbers, time_at, frame_at, told, head)
+    table = TableRows(path, told, at_line[1:])
+    seconds, told_in = (None, "") if time_at is None else _seconds(table, numbers, time_at, frame_at, head)
     frame_at = time_at if seconds is None and frame_at is None else frame_at
     where = np.array(list(columns.values()))
     if frame_at is None and seconds is not None and len(people) == 1:
         require_told_apart(path, seconds, numbers[:, where.ravel()])
-    frame, step = _frames(path, numbers, frame_at, told, seconds, at_line[1:])
+    frame, step = _frames(table, numbers, frame_at, seconds)
     at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     seen: set[tuple[int, str]] = set()
     for number, (t, person) in enumerate(zip(frame.tolist(), told, strict=True)):
         if (t, person) in seen:
             who = f" of {person}" if person else ""
-            line = at_line[number + 1]
+            line = table.lines[number]
             raise ValueError(f"{path}, line {line}: a second row{who} for frame {t}; is a column person missing?")
         seen.add((t, person))
         at[t, people.index(person)] = numbers[number][where]
@@ -109,7 +111,7 @@ def read_table(path: str | Path) -> JointTable:
     at[(at == 0).all(axis=-1)] = np.nan  # as many trackers say that they did not find a joint
     if (at > MOST_AWAY).any() or (at < -MOST_AWAY).any():
         raise ValueError(f"{path}: a joint is {np.nanmax(np.abs(at)):.2g} away: numbers are damaged")
-    fps = None if seconds is None else _rate(seconds, frame, told)
+    fps = None if seconds is None else _rate(table, seconds, frame)
     first = None if frame_at is None else int(numbers[:, frame_at].min())
     second = None if seconds is None else _first_time(seconds, frame, fps)
     return _side_by_side(JointTable(tuple(columns), people, at, fps, unit, step, first, second, told_in))
@@ -208,24 +210,20 @@ def _number(path: Path, line: int, row: Sequence[str], k: int, sign: str) -> flo
 
 
 def _frames(
-    path: Path,
-    numbers: Floats,
-    column: int | None,
-    told: Sequence[str],
-    seconds: Floats | None,
-    lines: Sequence[int],
+    table: TableRows, numbers: Floats, column: int | None, seconds: Floats | None
 ) -> tuple[NDArray[np.int64], int]:
     """The frame of each row, from 0, and by how many the file counts on from one to the next."""
+    path = table.path
     if column is None:
         if seconds is not None and np.isfinite(seconds).all():
-            frame = frames_by_time(path, seconds, told, lines)
+            frame = frames_by_time(table, seconds)
             if frame.max() >= LONGEST:
                 long = f"{np.ptp(seconds):.6g} seconds"
                 raise ValueError(f"{path}: times of {long}, more frames than are read ({LONGEST})")
             return frame, 1
         count: dict[str, int] = {}
         frames = []
-        for person in told:
+        for person in table.told:
             frames.append(count.setdefault(person, 0))
             count[person] += 1
         if len(set(count.values())) > 1:
@@ -238,10 +236,10 @@ def _frames(
     said = numbers[:, column]
     if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:
         raise ValueError(f"{path}: frame {wrong[0]:g}: expected whole numbers")
-    if len(set(zip(told, said.tolist(), strict=True))) < len(said):
-        require_one_recording(path, said, told, lines, "frames")
+    if len(set(zip(table.told, said.tolist(), strict=True))) < len(said):
+        require_one_recording(table, said, "frames")
     if seconds is not None:
-        require_times_with_frames(path, seconds, said, told, lines)
+        require_times_with_frames(table, seconds, said)
     frame = np.minimum(said - said.min(), 2.0**53).astype(np.int64)
     step = max(int(np.gcd.reduce(frame)), 1) if len(set(frame.tolist())) > 2 else 1
     if frame.max() // step >= LONGEST:
@@ -249,23 +247,22 @@ def _frames(
     return frame // step, step
 
 
-def _steps(values: Floats, told: Sequence[str]) -> Floats:
+def _steps(table: TableRows, values: Floats) -> Floats:
     """From each value of a person to the next. -> (N,), none below 0"""
-    good = np.isfinite(values)
-    whose = np.array(told)
-    return np.concatenate([np.diff(np.sort(values[good & (whose == person)])) for person in set(told)])
+    each = (values[rows] for rows in table.of_each)
+    return np.concatenate([np.diff(np.sort(own[np.isfinite(own)])) for own in each])
 
 
 def _seconds(
-    numbers: Floats, column: int, frames: int | None, told: Sequence[str], head: Sequence[str]
+    table: TableRows, numbers: Floats, column: int, frames: int | None, head: Sequence[str]
 ) -> tuple[Floats | None, str]:
     """Times in seconds, and a word on what they were understood as, if not that; None: they are numbers of frames.
 
     Smaller parts of a second are told by the frames a second that they make, those that a column counts.
     """
     said = numbers[:, column]
-    good, steps = said[np.isfinite(said)], _steps(said, told)
-    counted = np.ones(1) if frames is None else _steps(numbers[:, frames], told)
+    good, steps = said[np.isfinite(said)], _steps(table, said)
+    counted = np.ones(1) if frames is None else _steps(table, numbers[:, frames])
     usual = max(float(np.median(counted[counted > 0])), 1.0) if (counted > 0).any() else 1.0
     step = 0.0
     if len(np.unique(good)) > 2:  # where many rows have one time, such as whole seconds, the mean tells
@@ -287,12 +284,11 @@ def _first_time(seconds: Floats, frame: NDArray[np.int64], fps: float | None) ->
     return float(seconds[row] - (frame[row] / fps if fps else 0.0))
 
 
-def _rate(seconds: Floats, frame: NDArray[np.int64], told: Sequence[str]) -> float | None:
+def _rate(table: TableRows, seconds: Floats, frame: NDArray[np.int64]) -> float | None:
     """Frames a second, by the first and the last row that say a time, of who has them for longest."""
-    good, whose = np.isfinite(seconds), np.array(told)
     found: list[tuple[float, float]] = []
-    for person in dict.fromkeys(told):
-        mine = np.flatnonzero(good & (whose == person))
+    for rows in table.of_each:
+        mine = rows[np.isfinite(seconds[rows])]
         mine = mine[np.argsort(frame[mine], kind="stable")]
         times, first = np.unique(seconds[mine], return_index=True)
         if len(mine) >= COARSE * len(times):  # a first time may have begun before its first row

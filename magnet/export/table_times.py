@@ -4,6 +4,8 @@ told by nothing, which are refused."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -32,19 +34,41 @@ JUMPING = 3.0
 """Times farther from a row to the next than to the one a time later, at least, where they are of two people."""
 
 
-def require_one_recording(path: Path, values: Floats, told: Sequence[str], lines: Sequence[int], what: str) -> None:
-    """Refuse rows of somebody whose times or frames go through the same moments twice, as two recordings do.
-
-    Rows in any order pass.
+@dataclass(frozen=True)
+class TableRows:
+    """The N rows of a table.
 
     Args:
         path: the table.
-        values: (N,) times or numbers of frames.
-        told: (N,) whose rows.
-        lines: (N,) where they are in the file.
-        what: the values are.
+        told: whose each is; "" of nobody in particular.
+        lines: where each stands in the file.
     """
-    for rows in _rows_of(told):
+
+    path: Path
+    told: Sequence[str]
+    lines: Sequence[int]
+
+    @cached_property
+    def of_each(self) -> list[Whole]:
+        """Each person's rows, in the file's order."""
+        whose = np.unique(np.array(self.told), return_inverse=True)[1]
+        return [np.flatnonzero(whose == p) for p in range(int(whose.max(initial=-1)) + 1)]
+
+    def name(self, rows: Whole) -> str:
+        """Whose rows of one person are."""
+        return self.told[rows[0]]
+
+    def whose(self, rows: Whole) -> str:
+        """The same within a sentence."""
+        return f" for {self.name(rows)}" if self.name(rows) else ""
+
+
+def require_one_recording(table: TableRows, values: Floats, what: str) -> None:
+    """Refuse rows of somebody whose times or frames go through the same moments twice, as two recordings do.
+
+    Rows in any order pass. values: (N,) times or numbers of frames, as `what` says
+    """
+    for rows in table.of_each:
         own = values[rows]
         forward = np.diff(own)
         ends = np.concatenate([np.flatnonzero(forward < 0), [len(own) - 1]])
@@ -57,20 +81,21 @@ def require_one_recording(path: Path, values: Floats, told: Sequence[str], lines
             shared = min(len(before) - np.searchsorted(before, after[0], "right"), np.searchsorted(after, before[-1]))
             if shared > OVERLAP or (before[-1] == after[-1] and begins[k] < ends[k]):
                 row = max(begins[k], begins[begins > 0].min())
-                who = "two recordings" if told[rows[0]] else "two recordings, or of two people without a column person"
+                of = (
+                    "two recordings" if table.name(rows) else "two recordings, or of two people without a column person"
+                )
                 raise ValueError(
-                    f"{path}, line {lines[rows[row]]}: {what} go back from {own[row - 1]:.6g} to {own[row]:.6g} and "
-                    f"through the same moments again{_whose(told, rows)}, as of {who}: save each in a file of its own"
+                    f"{table.path}, line {table.lines[rows[row]]}: {what} go back from {own[row - 1]:.6g} to "
+                    f"{own[row]:.6g} and through the same moments again{table.whose(rows)}, as of {of}: save each in a "
+                    "file of its own"
                 )
             last = k if after[-1] > before[-1] else last
 
 
-def require_times_with_frames(
-    path: Path, seconds: Floats, numbers: Floats, told: Sequence[str], lines: Sequence[int]
-) -> None:
+def require_times_with_frames(table: TableRows, seconds: Floats, numbers: Floats) -> None:
     """Refuse times that go back where numbers of frames go on."""
     good = np.isfinite(seconds) & np.isfinite(numbers)
-    for every in _rows_of(told):
+    for every in table.of_each:
         rows = every[good[every]]
         rows = rows[np.argsort(numbers[rows], kind="stable")]
         later = np.diff(seconds[rows])
@@ -80,9 +105,9 @@ def require_times_with_frames(
         if len(back):
             one, other = rows[back[0]], rows[back[0] + 1]
             raise ValueError(
-                f"{path}, line {lines[other]}: times go back from {seconds[one]:.6g} to {seconds[other]:.6g} s where "
-                f"frames go on{_whose(told, rows)}, as of two recordings: save each in a file of its own, or leave "
-                "the times out and say the rate with --in_fps"
+                f"{table.path}, line {table.lines[other]}: times go back from {seconds[one]:.6g} to "
+                f"{seconds[other]:.6g} s where frames go on{table.whose(rows)}, as of two recordings: save each in a "
+                "file of its own, or leave the times out and say the rate with --in_fps"
             )
 
 
@@ -105,32 +130,26 @@ def require_told_apart(path: Path, seconds: Floats, at: Floats) -> None:
         )
 
 
-def frames_by_time(path: Path, seconds: Floats, told: Sequence[str], lines: Sequence[int]) -> Whole:
-    """The frames of rows by their times, (N,), of which some may be missing.
+def frames_by_time(table: TableRows, seconds: Floats) -> Whole:
+    """The frames of rows by their times, (N,), all finite; some frames may be missing.
 
     The rows of one person are frames in order, so that times may be as coarse as whole seconds. Rows of several people
     with one time are of one frame; people of clocks that are a part of a frame apart have each their nearest.
 
-    Args:
-        path: the table.
-        seconds: (N,) times, all finite.
-        told: (N,) whose rows.
-        lines: (N,) where they are in the file.
-
     Raises:
         ValueError: two recordings, people of different rates, or times that do not tell which rows go together.
     """
-    require_one_recording(path, seconds, told, lines, "times")
-    people = [rows[np.argsort(seconds[rows], kind="stable")] for rows in _rows_of(told)]
+    require_one_recording(table, seconds, "times")
+    people = [rows[np.argsort(seconds[rows], kind="stable")] for rows in table.of_each]
     steps = [np.diff(seconds[rows]) for rows in people]
     step, usual = _step(np.concatenate(steps))
     frame = np.zeros(len(seconds), np.int64)
     if len(people) == 1:
-        frame[people[0]] = _counted(path, seconds[people[0]], step)
+        frame[people[0]] = _counted(table.path, seconds[people[0]], step)
         return frame
     if any((own == 0).any() for own in steps):
-        return _in_order(path, seconds, told, people, step)
-    _require_one_rate(path, told, people, steps)
+        return _in_order(table, seconds, people, step)
+    _require_one_rate(table, people, steps)
     times = np.unique(seconds)
     later = np.diff(times)
     seen = np.zeros((len(times), len(people)), bool)
@@ -138,20 +157,10 @@ def frames_by_time(path: Path, seconds: Floats, told: Sequence[str], lines: Sequ
         seen[np.searchsorted(times, seconds[rows]), p] = True
     others = ~(seen[1:] & seen[:-1]).any(axis=1)
     if (others & (later > NEAR * usual) & (later < APART * usual)).any():
-        return _of_own_clocks(path, seconds, told, people, step)
+        return _of_own_clocks(table, seconds, people, step)
     new = np.concatenate([[True], later > (NEAR * usual if np.isfinite(usual) else 0.0)])
-    of_new = _counted(path, times[new], step)
+    of_new = _counted(table.path, times[new], step)
     return np.asarray(of_new[np.cumsum(new) - 1][np.searchsorted(times, seconds)], np.int64)
-
-
-def _rows_of(told: Sequence[str]) -> list[Whole]:
-    """Each person's rows, in the file's order."""
-    whose = np.unique(np.array(told), return_inverse=True)[1]
-    return [np.flatnonzero(whose == p) for p in range(int(whose.max(initial=-1)) + 1)]
-
-
-def _whose(told: Sequence[str], rows: Whole) -> str:
-    return f" for {told[rows[0]]}" if told[rows[0]] else ""
 
 
 def _step(steps: Floats) -> tuple[float, float]:
@@ -183,7 +192,7 @@ def _counted(path: Path, times: Floats, step: float) -> Whole:
     )
 
 
-def _in_order(path: Path, seconds: Floats, told: Sequence[str], people: Sequence[Whole], step: float) -> Whole:
+def _in_order(table: TableRows, seconds: Floats, people: Sequence[Whole], step: float) -> Whole:
     """The frames of people with several rows of one time each: equally many of all are of the same frames in order."""
     first = people[0]
     for rows in people[1:]:
@@ -195,34 +204,34 @@ def _in_order(path: Path, seconds: Floats, told: Sequence[str], people: Sequence
             ]
             k = int(np.flatnonzero(counts[0] != counts[1])[0])
             raise ValueError(
-                f"{path}: at {every[k]:.6g} s {told[first[0]]} has {counts[0][k]} rows and {told[rows[0]]} "
-                f"{counts[1][k]}, and nothing says which go together; add a column frame, or write times that tell "
-                "frames apart"
+                f"{table.path}: at {every[k]:.6g} s {table.name(first)} has {counts[0][k]} rows and "
+                f"{table.name(rows)} {counts[1][k]}, and nothing says which go together; add a column frame, or write "
+                "times that tell frames apart"
             )
     frame = np.zeros(len(seconds), np.int64)
     for rows in people:
-        frame[rows] = _counted(path, seconds[rows], step)
+        frame[rows] = _counted(table.path, seconds[rows], step)
     return frame
 
 
-def _require_one_rate(path: Path, told: Sequence[str], people: Sequence[Whole], steps: Sequence[Floats]) -> None:
+def _require_one_rate(table: TableRows, people: Sequence[Whole], steps: Sequence[Floats]) -> None:
     """Refuse people whose rows come at different rates, each of which is sure."""
     rates = {}
     for rows, own in zip(people, steps, strict=True):
         usual = float(np.median(own)) if len(own) >= COUNTED else 0.0
         if usual and (np.abs(own - usual) < SAME * usual).mean() >= REGULAR:
-            rates[told[rows[0]]] = 1 / usual
+            rates[table.name(rows)] = 1 / usual
     if rates and max(rates.values()) > OTHER_RATE * min(rates.values()):
         said = ", ".join(f"{name} {rate:.3g}" for name, rate in rates.items())
         raise ValueError(
-            f"{path}: people's rows come at different rates ({said} a second): give each a file of their own, and read "
-            "these together with --fps 30"
+            f"{table.path}: people's rows come at different rates ({said} a second): give each a file of their own, "
+            "and read these together with --fps 30"
         )
 
 
-def _of_own_clocks(path: Path, seconds: Floats, told: Sequence[str], people: Sequence[Whole], step: float) -> Whole:
+def _of_own_clocks(table: TableRows, seconds: Floats, people: Sequence[Whole], step: float) -> Whole:
     """The frames of people whose times are a part of a frame apart: each counts on from the nearest common one."""
-    own = [_counted(path, seconds[rows], step) for rows in people]
+    own = [_counted(table.path, seconds[rows], step) for rows in people]
     spans = [np.ptp(seconds[rows]) / count[-1] for rows, count in zip(people, own, strict=True) if count[-1] > 0]
     even = float(np.median(spans)) if spans else step
     start, frame = float(seconds.min()), np.zeros(len(seconds), np.int64)
@@ -232,7 +241,7 @@ def _of_own_clocks(path: Path, seconds: Floats, told: Sequence[str], people: Seq
         off = even * float(np.abs(since - frame[rows]).max())
         if off > max(DRIFT * even, DRIFTS):
             raise ValueError(
-                f"{path}: times of people run apart{_whose(told, rows)} by up to {off:.2g} s: bring them to one clock "
-                "and rate"
+                f"{table.path}: times of people run apart{table.whose(rows)} by up to {off:.2g} s: bring them to one "
+                "clock and rate"
             )
     return np.asarray(frame - frame.min(), np.int64)
