@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body import Body
+from magnet.body import Body, load_body
 from magnet.export.drawing import AGENTS, CONTEXT, STYLES, Array, Canvas, Style, drawable
 from magnet.export.figures import add_capsules, add_mesh, add_sticks
-from magnet.export.page.light import Light, light
+from magnet.export.page.light import light
 from magnet.motion.scene import Scene
 
 Scenes = Scene | list[tuple[str, Scene]] | dict[str, Scene]
@@ -46,16 +46,6 @@ class Cast:
         """(P, V, 3)"""
         return self.body.vertices(self.scene.slice(frame, frame + 1))[0, 0].detach().cpu().numpy().astype(np.float64)
 
-    def few(self) -> Light:
-        """The body's light mesh.
-
-        Raises:
-            ValueError: the body is none of ours, which have a rest shape and weights.
-        """
-        if not isinstance(self.body, Body):
-            raise ValueError(f"style light: expected a magnet.body.Body, got {type(self.body).__name__}; use body")
-        return light(self.body, LIGHT)
-
     def draw(self, canvas: Canvas, frame: int) -> None:
         """Put everybody on the canvas; nothing is painted yet."""
         joints, colours = self.joints[frame], self.colours[frame]
@@ -64,7 +54,7 @@ class Cast:
         elif self.style == "capsules":
             add_capsules(canvas, joints, colours)
         elif self.style == "light":
-            few = self.few()
+            few = light(self.body, LIGHT)
             add_mesh(canvas, self.vertices(frame)[:, few.keep], few.faces, colours)
         else:
             add_mesh(canvas, self.vertices(frame), self.body.faces.cpu().numpy(), colours)
@@ -104,8 +94,6 @@ def default_body(scene: Scene) -> Body:
     Raises:
         ValueError: the scene belongs to another body, which must be given.
     """
-    from magnet.body import load_body  # late: drawing with a given body needs no packaged one
-
     body = load_body("open")
     if scene.body != body.id:
         raise ValueError(

@@ -241,25 +241,23 @@ class Canvas:
         view = self.view
         light = view.light
         small = View(view.centre, view.axes, view.distance, view.focal / 4, (view.size[0] // 4, view.size[1] // 4))
-        mask = Image.new("L", small.size, 0)
-        draw = ImageDraw.Draw(mask)
+
+        def cast(ends: Array, radius: Array, inks: Array, blur: float) -> NDArray[np.uint8]:
+            """Blurred strokes between both ends on the floor (M, 2, 3). radius (M, 1), inks (M,)"""
+            image = Image.new("L", small.size, 0)
+            draw = ImageDraw.Draw(image)
+            pixels, depth = small.project(ends)
+            widths = radius * small.focal / np.maximum(depth, 0.3)
+            outlines = strokes(pixels[:, 0], pixels[:, 1], widths[:, 0], widths[:, 1], squash=0.6)
+            for outline, ink in zip(outlines.reshape(len(ends), -1).tolist(), inks.astype(int).tolist(), strict=True):
+                draw.polygon(outline, fill=ink)
+            return np.asarray(image.filter(ImageFilter.BoxBlur(blur * small.size[1] / 240)))
+
         ends = np.stack([start, end], axis=1)
-        pixels, depth = small.project(ends - light * (ends[..., 1:2] / light[1]))
-        widths = radius[:, None] * small.focal / np.maximum(depth, 0.3)
-        outlines = strokes(pixels[:, 0], pixels[:, 1], widths[:, 0], widths[:, 1], squash=0.6)
-        for outline in outlines.reshape(len(ends), -1).tolist():
-            draw.polygon(outline, fill=66)
-        mask = mask.filter(ImageFilter.BoxBlur(1.6 * small.size[1] / 240))
-        touch = Image.new("L", small.size, 0)
-        draw = ImageDraw.Draw(touch)
-        pixels, depth = small.project(feet * np.array([1.0, 0.0, 1.0]))
-        widths = 0.055 * small.focal / np.maximum(depth, 0.3)
+        limbs = cast(ends - light * (ends[..., 1:2] / light[1]), radius[:, None], np.full(len(ends), 66), 1.6)
         near = np.clip(1.0 - (feet[..., 1].min(axis=-1) - 0.03) / 0.15, 0.0, 1.0) * 125
-        outlines = strokes(pixels[:, 0], pixels[:, 1], widths[:, 0], widths[:, 1], squash=0.6)
-        for outline, ink in zip(outlines.reshape(len(feet), -1).tolist(), near.astype(int).tolist(), strict=True):
-            draw.polygon(outline, fill=ink)
-        touch = touch.filter(ImageFilter.BoxBlur(0.9 * small.size[1] / 240))
-        mask = Image.fromarray(np.maximum(np.asarray(mask), np.asarray(touch)))
+        touch = cast(feet * np.array([1.0, 0.0, 1.0]), np.full((len(feet), 1), 0.055), near, 0.9)
+        mask = Image.fromarray(np.maximum(limbs, touch))
         box = mask.getbbox()
         if box is None:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +58,9 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
         if not shape:
             shape |= gltf.shape_of(body, betas)
         pelvis, floor = gltf.person(slot, standing(body, betas), {**skin, **shape}, bones)
-        T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu()
         clip = scene_clip if bones.clips == "scene" else animation(f"person_{slot}")
-        if floor is not None:
-            T_world_floor = canonical_frame(T_above_pelvis)
-            T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
-            gltf.animate(clip, times, floor, T_world_floor[:, :3, 3], T_world_floor[:, None, :3, :3])
-        local = torch.cat([T_above_pelvis[:, None, :3, :3], scene.body_rot[0, :, slot].detach().cpu()], dim=1)
-        gltf.animate(clip, times, pelvis, T_above_pelvis[:, :3, 3], local)
+        nodes = [*([] if floor is None else [floor]), *range(pelvis, pelvis + BODY_JOINTS)]
+        gltf.animate(clip, times, nodes, *moved(scene, slot, bones.root == "floor"))
         if bones.clips == "person":
             gltf.document["animations"].append(clip)
     if bones.clips == "scene":
@@ -121,6 +117,24 @@ def _resting(body: Body, betas: Tensor) -> Tensor:
 def _raised(vertices: Tensor) -> Tensor:
     """By how much a resting body must be raised to stand on y = 0. (V, 3) -> (3,)"""
     return torch.tensor([0.0, -float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
+
+
+def moved(scene: Scene, slot: int, floor: bool = False) -> tuple[Tensor, Tensor]:
+    """How a person of a scene (B = 1) moves, joint by joint, below a bone on the floor or without one.
+
+    Returns:
+        Places of the pelvis, or of the bone on the floor and of it, (T, n, 3); and turns of this bone and all joints
+        relative to the one above, (T, n + 21, 4), x y z w. float64
+    """
+    T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu().double()
+    above = []
+    if floor:
+        T_world_floor = canonical_frame(T_above_pelvis)
+        T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
+        above = [T_world_floor]
+    frames = torch.stack([*above, T_above_pelvis], dim=1)
+    local = torch.cat([frames[..., :3, :3], scene.body_rot[0, :, slot].detach().cpu().double()], dim=1)
+    return frames[..., :3, 3], unbroken(to_quat(local))
 
 
 class Gltf:
@@ -240,12 +254,12 @@ class Gltf:
             self.add("nodes", node | ({"children": children} if children else {}))
         return pelvis
 
-    def animate(self, clip: dict[str, Any], times: int, first: int, place: Tensor, local: Tensor) -> None:
-        """Keyframes of nodes from `first` on, of which it alone moves. place (T, 3), local (T, n, 3, 3)"""
-        quaternions = unbroken(to_quat(local.double()))
-        self.track(clip, times, first, "translation", place)
-        for j in range(local.shape[1]):
-            self.track(clip, times, first + j, "rotation", quaternions[:, j])
+    def animate(self, clip: dict[str, Any], times: int, nodes: Sequence[int], place: Tensor, turns: Tensor) -> None:
+        """Keyframes of nodes, of which the first ones move and all turn. place (T, n, 3), turns (T, J, 4) x y z w"""
+        for j, node in enumerate(nodes):
+            if j < place.shape[1]:
+                self.track(clip, times, node, "translation", place[:, j])
+            self.track(clip, times, node, "rotation", turns[:, j])
 
     def track(self, clip: dict[str, Any], times: int, node: int, what: str, values: Tensor) -> None:
         """Keyframes of a node's translation (T, 3) or rotation (T, 4), x y z w."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import copy
 import json
 import mimetypes
@@ -94,10 +93,7 @@ class GltfFile:
         if head.startswith("data:"):
             if not head.endswith(";base64"):
                 raise ValueError(f"its {what} in a URI ({said:.40}) that is not in base64: export it again")
-            try:
-                return base64.b64decode(content, validate=True)
-            except binascii.Error as error:
-                raise ValueError(str(error)) from error
+            return base64.b64decode(content, validate=True)  # a ValueError where it is none
         place = self.path.parent / unquote(said)
         try:  # what lies elsewhere would be put into files that are passed on
             beside = place.resolve().is_relative_to(self.path.parent.resolve()) and place.is_file()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,18 +17,8 @@ from magnet.body import Body
 from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
-from magnet.export.glb import (
-    INFLUENCES,
-    influences,
-    linear,
-    slots_to_write,
-    standing,
-    standing_vertices,
-    unbroken,
-)
+from magnet.export.glb import INFLUENCES, influences, linear, moved, slots_to_write, standing, standing_vertices
 from magnet.files import whole
-from magnet.motion.frames import canonical_frame, inverse
-from magnet.motion.rotations import to_quat
 from magnet.motion.scene import Scene
 
 NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
@@ -93,24 +82,11 @@ def _save_stage(scene: Scene, path: Path, body: Body, bones: BoneOptions, slots:
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
     for slot in slots:
         betas = scene.betas[0, slot].detach().cpu().float()
-        place, turns = _moved(scene, slot, bones)
+        place, turns = moved(scene, slot, bones.root == "floor")
         root = UsdSkel.Root.Define(stage, f"/scene/person_{slot}")
         _skeleton(stage, root, standing(body, betas), bones, place, turns)
         _skin(stage, root, standing_vertices(body, betas), body, slot)
     stage.GetRootLayer().Save()
-
-
-def _moved(scene: Scene, slot: int, bones: BoneOptions) -> tuple[Tensor, Tensor]:
-    """Places of the first joint, or of the one on the floor and of it, and turns of all. -> (T, n, 3), (T, J, 4)"""
-    T_above_pelvis = scene.T_world_root[0, :, slot].detach().cpu().double()
-    above = []
-    if bones.root == "floor":
-        T_world_floor = canonical_frame(T_above_pelvis)
-        T_above_pelvis = inverse(T_world_floor) @ T_above_pelvis
-        above = [T_world_floor]
-    frames = torch.stack([*above, T_above_pelvis], dim=1)
-    local = torch.cat([frames[..., :3, :3], scene.body_rot[0, :, slot].detach().cpu().double()], dim=1)
-    return frames[..., :3, 3], unbroken(to_quat(local))
 
 
 def _skeleton(stage: Any, root: Any, rest: Tensor, bones: BoneOptions, place: Tensor, turns: Tensor) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from magnet.body import Body
 from magnet.export.bones import bone_names
 from magnet.export.bvh import paths_of
-from magnet.export.glb import FLOAT, Gltf, animation, frame_times, slots_to_write, standing
+from magnet.export.glb import FLOAT, Gltf, animation, frame_times, moved, slots_to_write, standing
 from magnet.files import whole
-from magnet.motion.scene import Scene
+from magnet.motion.scene import BODY_JOINTS, Scene
 
 EXTENSION = "VRMC_vrm_animation"
 
@@ -35,10 +33,8 @@ def save_vrma(scene: Scene, path: str | Path, body: Body) -> list[Path]:
         times = gltf.accessor(frame_times(scene.frames, scene.fps), FLOAT, "SCALAR", bounds=True)
         hips = gltf.bones(standing(body, scene.betas[0, slot].detach().cpu().float()), "vrm")
         gltf.document["scenes"][0]["nodes"].append(hips)
-        T_world_hips, turns = (x[0, :, slot].detach().cpu() for x in (scene.T_world_root, scene.body_rot))
         clip = animation("motion")
-        local = torch.cat([T_world_hips[:, None, :3, :3], turns], dim=1)
-        gltf.animate(clip, times, hips, T_world_hips[:, :3, 3], local)
+        gltf.animate(clip, times, range(hips, hips + BODY_JOINTS), *moved(scene, slot))
         gltf.document["animations"].append(clip)
         roles = {name: {"node": hips + j} for j, name in enumerate(bone_names("vrm"))}
         gltf.document["extensionsUsed"] = [EXTENSION]

@@ -13,7 +13,7 @@ from magnet.body.joints import PARENTS
 from magnet.datamodules.fakes.body import write_body
 from magnet.datamodules.fakes.motion import UP, Array, FakeMotion, local_rotations, people, rest_joints, world_rotations
 from magnet.export.bones import bone_names
-from magnet.export.glb import FLOAT, Gltf, animation
+from magnet.export.glb import FLOAT, Gltf, animation, unbroken
 from magnet.motion.rotations import to_quat
 from magnet.motion.scene import FPS
 
@@ -71,7 +71,8 @@ def _person(gltf: Gltf, times: int, shown: FakeMotion, person: int) -> None:
     joints = [first + k for k in range(len(PARENTS))]
     gltf.add("skins", {"name": label, "joints": joints, "inverseBindMatrices": matrices})
     clip = animation(f"{label} walks")
-    gltf.animate(clip, times, first, torch.from_numpy(place), torch.from_numpy(local))
+    turns = unbroken(to_quat(torch.from_numpy(local)))
+    gltf.animate(clip, times, joints, torch.from_numpy(place)[:, None], turns)
     gltf.add("animations", clip)
 
 

@@ -19,6 +19,7 @@ from magnet.body.base import Body
 from magnet.body.contact import DEEP, TOUCH
 from magnet.body.joints import PARENTS
 from magnet.export.drawing import STYLES, Style
+from magnet.export.glb import unbroken
 from magnet.export.page.marks import marked
 from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
 from magnet.export.page.rig import Rig, bone_poses, first_style, rigs
@@ -171,9 +172,7 @@ def _poses(body: Body, scene: Scene) -> tuple[NDArray[np.int16], NDArray[np.floa
         part_turns, part_places = bone_poses(body, scene.slice(first, first + CHUNK))
         turns.append(part_turns)
         roots.append(part_places[..., 0, :])
-    wxyz = np.concatenate(turns)
-    flips = np.where((wxyz[1:] * wxyz[:-1]).sum(axis=-1) < 0, -1.0, 1.0).cumprod(axis=0)
-    wxyz[1:] *= flips[..., None]
+    wxyz = unbroken(torch.from_numpy(np.concatenate(turns))).numpy()
     return (wxyz * FULL).round().astype(np.int16), np.concatenate(roots).astype(np.float32)
 
 
