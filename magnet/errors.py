@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Sequence
 
 PACKAGE = __name__.partition(".")[0]
 
@@ -19,6 +20,12 @@ def warn_user(message: str) -> None:
 def counted(number: int, what: str) -> str:
     """As "1 scene", "2 scenes"."""
     return f"{number} {what}{'s' * (number != 1)}"
+
+
+def first_names(names: Sequence[str], most: int) -> str:
+    """The first of many names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 class DataError(ValueError):

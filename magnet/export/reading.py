@@ -78,7 +78,7 @@ def read(
         if options.in_fps is not None:
             said = f"a {min(suffixes)} says its own, --fps resamples"
             raise ValueError(f"in_fps: is for {', '.join((*ARRAYS, TABLE))} files that say no frame rate; {said}")
-        imported = load_rigs(files, body, options)
+        imported = load_rigs(files, body, **vars(options))
         notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
         if abs(imported.floor) >= UNSEEN:
             way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from magnet.body.joints import (  # isort: skip
     PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
 )  # fmt: skip
 from magnet.body.fit import fit_body, floor_height, jumps_in, swing
+from magnet.errors import first_names
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock, together
@@ -78,8 +80,7 @@ class Source:
             if self.poor:
                 lines.append("  that is much: its proportions are far from a person's; hands and feet may miss")
             if self.unused:
-                more = f" and {len(self.unused) - SHOWN} more" if len(self.unused) > SHOWN else ""
-                lines.append(f"  not mapped: {', '.join(self.unused[:SHOWN])}{more}")
+                lines.append(f"  not mapped: {first_names(self.unused, SHOWN)}")
         if self.jumps:
             lines.append(f"  {_jumps_said(self.jumps)}")
         return "\n".join(lines)
@@ -107,7 +108,7 @@ class Imported:
     rates: tuple[float, ...] = ()  # frames a second of each file
 
 
-def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, options: Reading = Reading()) -> Imported:
+def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any) -> Imported:
     """Read BVH, glTF, VRM or FBX files, of one person or several: our own, or any skeleton with known joint names.
 
     A skeleton that is the body's own is restored exactly; any other is fitted: limbs to positions, all else to
@@ -115,12 +116,16 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, options: Rea
     suits them all. The up axis is y of glTF and FBX, as their formats say, else found from where torsos point, and from
     rest poses where somebody lies.
 
+    Args:
+        **said: what the files do not state, as for `Reading`.
+
     Raises:
         FileNotFoundError: there is no such file.
         ImportError: an FBX, and no Blender.
         ValueError: not such a file, unknown names, units or up axis, rates or lengths that differ, no fit, no such
             frames.
     """
+    options = Reading(**said)
     each = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
     if not each:
         raise ValueError("no files given")

@@ -18,7 +18,6 @@ from magnet.export import load_rigs, save_bvh
 from magnet.export.bones import Names, bone_names
 from magnet.export.bvh import euler_zxy
 from magnet.export.bvh_read import read_bvh
-from magnet.export.read_options import Reading
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -210,7 +209,7 @@ def test_a_skeleton_of_other_names_comes_back_as_any_rig_does(names: Names, trio
     """Written for programs that retarget by these; a rig of theirs may look just so, so it is fitted."""
     paths = save_bvh(trio, tmp_path / "trio.bvh", body, names=names)
     assert sorted(read_bvh(paths[0]).names) == sorted(bone_names(names))
-    found = load_rigs(paths, body, Reading(keep_floor=True))
+    found = load_rigs(paths, body, keep_floor=True)
     assert not any(source.exact for source in found.sources)
     assert (body.joints(found.scene) - body.joints(trio)).norm(dim=-1).mean() < 0.02
 

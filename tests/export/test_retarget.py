@@ -21,7 +21,6 @@ from magnet.datamodules.reading.cmu_joints import measured
 from magnet.export import load_rigs, save_bvh
 from magnet.export.bvh_read import read_bvh
 from magnet.export.naming import recognised
-from magnet.export.read_options import Reading
 from magnet.export.retarget import Imported
 from magnet.export.rig import UP, understood_together
 from magnet.motion.rotations import geodesic
@@ -114,7 +113,7 @@ CASES = {
 @pytest.mark.parametrize("case", few(list(CASES)[::-1], 2))
 def test_a_person_comes_back_from_any_rig(case, truth: Truth, body: Body, tmp_path: Path):
     path = stranger(truth, body, tmp_path / "stranger.bvh", **CASES[case])
-    found = load_rigs(path, body, Reading(keep_floor=True))
+    found = load_rigs(path, body, keep_floor=True)
     (source,) = found.sources
     assert not source.exact and source.residual < 0.01
     distance, angle = errors(found, truth, body)
@@ -182,7 +181,7 @@ def test_rest_poses_make_no_difference(truth: Truth, body: Body, tmp_path: Path)
 
 def test_missing_toes_are_reported_and_feet_follow_the_ankles(truth: Truth, body: Body, tmp_path: Path):
     path = stranger(truth, body, tmp_path / "a.bvh", "biovision", drop=("left_foot", "right_foot"))
-    found = load_rigs(path, body, Reading(keep_floor=True))
+    found = load_rigs(path, body, keep_floor=True)
     assert not {"left_foot", "right_foot"} & set(found.sources[0].joints)
     distance, _ = errors(found, truth, body)
     assert distance[[7, 8]].max() < 0.015 and distance[[10, 11]].max() < 0.04
@@ -216,7 +215,7 @@ def test_people_keep_their_places_and_stand_on_the_floor(truth: Truth, body: Bod
     assert (apart - torch.tensor([1.5, 0.3, -1.0])).abs().max() < 5e-3
     lowest = body.vertices(found.scene)[0, ..., 1].amin(dim=(1, 2))
     assert lowest.median().abs() < 0.04
-    kept = body.joints(load_rigs(paths[:1], body, Reading(keep_floor=True)).scene)[0]
+    kept = body.joints(load_rigs(paths[:1], body, keep_floor=True).scene)[0]
     assert torch.allclose(kept[..., 1] - joints[:, :1, :, 1], torch.tensor(found.floor), atol=1e-4)
 
 
@@ -229,8 +228,8 @@ def test_files_of_other_rates_and_lengths_need_a_word(body: Body, tmp_path: Path
     ):
         load_rigs([a, b], body)
     with pytest.raises(ValueError, match=r"a\.bvh 30 frames, .*b\.bvh 15 frames.*--trim"):
-        load_rigs([a, b], body, Reading(fps=30))
-    both = load_rigs([a, b], body, Reading(fps=30, trim=True)).scene
+        load_rigs([a, b], body, fps=30)
+    both = load_rigs([a, b], body, fps=30, trim=True).scene
     assert (both.frames, both.agents, both.fps) == (15, 2, 30.0)
     truth = body.joints(duo)[0]
     assert (body.joints(both)[0, :, 0] - truth[:15, 0]).abs().max() < 1e-5
@@ -247,9 +246,9 @@ def test_an_unknown_skeleton_lists_its_names_and_can_be_told(truth: Truth, body:
     with pytest.raises(ValueError, match=r"cannot tell which joint is left_hip, .*it has Bone00, .*--joint left_hip="):
         load_rigs(path, body)
     with pytest.raises(ValueError, match="joint left_hip=Bone99: expected OUR_NAME=THEIR_NAME; it has Bone00"):
-        load_rigs(path, body, Reading(joints={"left_hip": "Bone99"}))
+        load_rigs(path, body, joints={"left_hip": "Bone99"})
     told = {JOINT_NAMES[j]: f"Bone{j:02}" for j in LIMBS}
-    found = load_rigs(path, body, Reading(joints=told, keep_floor=True))
+    found = load_rigs(path, body, joints=told, keep_floor=True)
     distance, _ = errors(found, truth, body)
     assert distance[LIMBS].max() < 0.015
 
@@ -259,9 +258,9 @@ def test_lengths_that_no_unit_explains_need_a_word(truth: Truth, body: Body, tmp
     with pytest.raises(ValueError, match=r"legs are .* long, which fits no unit"):
         load_rigs(path, body)
     with pytest.raises(ValueError, match="unit 'ell': expected one of m, cm, mm, inch, foot"):
-        load_rigs(path, body, Reading(unit="ell"))
+        load_rigs(path, body, unit="ell")
     with pytest.raises(ValueError, match="up axis 'w'"):
-        load_rigs(path, body, Reading(up="w"))
+        load_rigs(path, body, up="w")
 
 
 def test_a_skeleton_that_is_no_person_is_refused_or_called_poor(truth: Truth, body: Body, tmp_path: Path):
@@ -346,7 +345,7 @@ def test_a_rest_pose_in_the_first_frame_spoils_none_of_the_others(truth: Truth, 
     assert "everything jumps to frame 1 (a rest pose" in str(found.sources[0])
     assert "leave it out, --start 1" in str(found.sources[0])
     assert "jumps" not in str(plain.sources[0])
-    without = load_rigs(led, body, Reading(start=1))
+    without = load_rigs(led, body, start=1)
     assert without.scene.frames == plain.scene.frames and "jumps" not in str(without.sources[0])
     assert (body.joints(without.scene) - body.joints(plain.scene)).norm(dim=-1).max() < 1e-4
 
@@ -359,13 +358,13 @@ def test_where_everything_jumps_again_and_again_nothing_is_to_be_left_out(duet: 
     (path,) = save_bvh(poses.replace(T_world_root=far), tmp_path / "held.bvh", body)
     said = str(load_rigs(path, body).sources[0])
     assert "everything jumps to frames 8, 16, 24 (stepped keys, or cuts?" in said and "leave it out" not in said
-    said = str(load_rigs(path, body, Reading(start=10, end=22)).sources[0])
+    said = str(load_rigs(path, body, start=10, end=22).sources[0])
     assert "jumps to frame 16 (a cut?): keep one part, --end 16 or --start 16" in said, "numbers are the file's"
 
 
 def test_a_single_frame_is_enough(truth: Truth, body: Body, tmp_path: Path):
     still = Truth(truth.scene.slice(3, 4), truth.world[3:4], truth.joints[3:4])
-    found = load_rigs(stranger(still, body, tmp_path / "a.bvh", "rigify"), body, Reading(keep_floor=True))
+    found = load_rigs(stranger(still, body, tmp_path / "a.bvh", "rigify"), body, keep_floor=True)
     distance, _ = errors(found, still, body)
     assert found.scene.frames == 1 and distance[LIMBS].max() < 0.015
 
@@ -384,7 +383,7 @@ def test_a_node_above_the_hips_moves_everybody_below_it(truth: Truth, body: Body
     ]
     rows = [f"1.0 0.0 2.0 0 0 -90 {row}" for row in lines[motion + 3 :] if row]
     path.write_text("\n".join([lines[0], *above, *lines[1:motion], "}", *lines[motion : motion + 3], *rows]) + "\n")
-    found = load_rigs(path, body, Reading(keep_floor=True))
+    found = load_rigs(path, body, keep_floor=True)
     assert found.sources[0].up == "y"
     moved = Truth(truth.scene, truth.world, truth.joints + torch.tensor([1.0, 0.0, 2.0]))
     distance, angle = errors(found, moved, body)

@@ -15,10 +15,9 @@ from magnet.datamodules.clip import SPLITS, Split, at_least
 from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, convert_all, named_errors, take_key
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.preparing.progress import Tell
-from magnet.datamodules.reading.fields import first_names
 from magnet.datamodules.reading.recording import DataError, Reader, Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
-from magnet.errors import counted
+from magnet.errors import counted, first_names
 from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
 
 SHARD_ROWS = 2**18

@@ -13,6 +13,7 @@ import numpy as np
 
 from magnet.datamodules.reading.arrays import Doubles, floats, one_length, one_shape, require
 from magnet.datamodules.reading.recording import GENDERS, Axis, Gender, Recording
+from magnet.errors import first_names
 from magnet.unpickle import load_object_npy, load_pickle, mapping
 
 
@@ -142,12 +143,6 @@ def _folders(root: Path, parts: Sequence[str]) -> list[Path]:
 def listing(folder: Path, most: int = 8) -> str:
     """What a folder holds, in a few words."""
     return first_names([path.name + "/" * path.is_dir() for path in sorted(folder.iterdir())], most) or "nothing"
-
-
-def first_names(names: Sequence[str], most: int) -> str:
-    """The first of many names, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def natural(name: str) -> tuple[tuple[str, int], ...]:

@@ -24,7 +24,7 @@ from magnet.datamodules.reading.own_files import (
     of_others,
 )
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
-from magnet.errors import counted
+from magnet.errors import counted, first_names
 from magnet.export.cutting import rates_note
 from magnet.motion.scene import FPS
 
@@ -198,7 +198,7 @@ class OwnReader(Reader, Generic[T]):
         if set(sizes) == {1} and self.table is None and self.pattern is None and self.one_person_a_file:
             said.append(f"everybody is alone: no names tell who was recorded together; if some were, {HOW}")
         if left:
-            said.append(f"{counted(len(left), 'file')} of no scene: {_listed([path.name for path in left])}")
+            said.append(f"{counted(len(left), 'file')} of no scene: {first_names([path.name for path in left], SHOWN)}")
         if self.in_time:
             how = "fewer than four scenes: " if self.split is None else ""
             said.append(
@@ -352,9 +352,4 @@ def _some(groups: Mapping[str, SceneFiles], size: int) -> str:
         people = ", ".join(person_file.person or person_file.file.name for person_file in group.people)
         return f"{group.scene} ({people})" if size > 1 else group.scene
 
-    return _listed([shown(group) for group in groups.values() if len(group.people) == size])
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    return first_names([shown(group) for group in groups.values() if len(group.people) == size], SHOWN)

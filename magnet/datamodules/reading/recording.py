@@ -29,6 +29,11 @@ Gender = Literal["neutral", "male", "female"]
 GENDERS: tuple[Gender, ...] = get_args(Gender)
 
 
+def signed(up: str) -> Axis:
+    """An up axis with its sign: +z for z."""
+    return up if up.startswith("-") else f"+{up}"  # type: ignore[return-value]
+
+
 @dataclass(frozen=True)
 class Take:
     """One scene of a download, found by its file names alone.

@@ -15,7 +15,7 @@ from torch import Tensor
 from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
 from magnet.datamodules.reading.own import OwnReader
-from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording
+from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording, signed
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood_together
 from magnet.export.rig_motion import RigMotion
@@ -148,7 +148,7 @@ class RigReader(OwnReader[RigTrack]):
         ]
         return Recording(
             fps=tracks[0].fps,
-            up="+y" if differ else _axis(skeletons[0].up),
+            up="+y" if differ else signed(skeletons[0].up),
             positions=np.stack(places, axis=1),
             joints=tuple(joints),
             valid=np.stack([track.valid for track in tracks], axis=1),
@@ -161,10 +161,6 @@ class RigReader(OwnReader[RigTrack]):
         )
 
 
-def _axis(up: str) -> Axis:
-    return up if up.startswith("-") else f"+{up}"  # type: ignore[return-value]
-
-
 def _said(track: RigTrack, skeleton: Skeleton) -> str:
     """How a file was read, in words that are the same for files of one kind."""
     naming, names = skeleton.naming, skeleton.file.names
@@ -173,7 +169,7 @@ def _said(track: RigTrack, skeleton: Skeleton) -> str:
     more = f", ... {len(rest)} in all" if len(rest) > SHOWN else ""
     unused = f"; not used: {', '.join(rest[:SHOWN])}{more}" if rest else ""
     return (
-        f"names of {naming.scheme}, {len(naming.joints)} joints; {skeleton.unit}, {_axis(skeleton.up)} up, "
+        f"names of {naming.scheme}, {len(naming.joints)} joints; {skeleton.unit}, {signed(skeleton.up)} up, "
         f"{track.said_fps:g} fps{unused}{''.join(f'; {note}' for note in skeleton.notes)}"
     )
 

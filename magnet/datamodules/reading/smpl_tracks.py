@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magnet.body import load_body
 from magnet.datamodules.reading.arrays import Doubles
-from magnet.datamodules.reading.recording import Axis, Gender
+from magnet.datamodules.reading.recording import Axis, Gender, signed
 from magnet.export.npz import stance_in
 from magnet.export.rig import UP
 from magnet.export.smpl_clock import Numbers, require_one_beginning, shared_clock
@@ -142,7 +142,7 @@ def of_own_axes(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tuple[li
         ]
         ups = agreed(found)
         notes = [f"{file.name}: {note}" for k, file in enumerate(files) for note in said(found, ups, k)]
-    return [replace(track, up=_signed(up)) for track, up in zip(tracks, ups, strict=True)], notes
+    return [replace(track, up=signed(up)) for track, up in zip(tracks, ups, strict=True)], notes
 
 
 def standing(tracks: Sequence[PosedTrack]) -> str:
@@ -163,7 +163,3 @@ def _scene(track: PosedTrack, up: str, body: str) -> Scene:
         fps=track.fps,
         body=body,
     )
-
-
-def _signed(up: str) -> Axis:
-    return up if up.startswith("-") else f"+{up}"  # type: ignore[return-value]

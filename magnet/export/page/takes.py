@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magnet.errors import first_names
 from magnet.export.drawing import Array
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
@@ -96,7 +97,7 @@ def titled(takes: Sequence[ShownTake], most: int = 3) -> str:
     """A title for takes: their labels, those of one file once; of many the first, and how many more."""
     names = list(dict.fromkeys(each.label.partition(BETWEEN)[0] for each in takes))
     names = [takes[0].label] if len(takes) == 1 else names
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return first_names(names, most)
 
 
 def same_length(one: ShownTake, other: ShownTake) -> Scene:
