@@ -1,120 +1,35 @@
-"""What `magnet data` shows: the list of data sets, tables of splits, takes that were skipped, progress."""
+"""What `magnet data` shows: tables of splits, takes that were skipped, notes, progress, how to train."""
 
 from __future__ import annotations
 
-import argparse
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any
 
-from magnet.cli import answers
+from rich.console import Console
+from rich.progress import DownloadColumn, TransferSpeedColumn
+from rich.table import Table
+
+from magnet.cli.errors import show_some
+from magnet.datamodules import registry
+from magnet.datamodules.clip import SPLITS
+from magnet.datamodules.options import HELD_OUT
+from magnet.datamodules.preparing.check import split_gaps
+from magnet.datamodules.preparing.progress import Tell, bar_with
 from magnet.errors import counted
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from magnet.datamodules.preparing.progress import Tell
-    from magnet.datamodules.reading.recording import Reader
-    from magnet.plugins import Registered
+from magnet.motion.scene import FPS
 
 SKIPPED_SHOWN, PROBLEMS_SHOWN, PERSONS_SHOWN, NOTES_SHOWN = 20, 40, 8, 8
 TUNING, WHERE_CONFIGS = "configs/finetune.yaml", "configs/ is in a clone of the repository"
 TUNED_HORIZON = 90
 """Frames that a test scene goes on for in configs/finetune.yaml, after its context."""
-BODIES = {
-    "smplx": "--body SMPLX_NEUTRAL.npz",
-    "smpl": "--body SMPLX_NEUTRAL.npz --bodies SMPL",
-    "smplh": "--body SMPLX_NEUTRAL.npz --bodies SMPLH",
-}
-"""The body that shape numbers need, by family: SMPL's and SMPL-H's are expressed in SMPL-X's."""
-WHERE = {
-    "smplx": "SMPL-X's file, npz or pkl, is from https://smpl-x.is.tue.mpg.de (register)",
-    "smpl": "SMPL: the folder of its files, npz or pkl, from https://smpl.is.tue.mpg.de (register)",
-    "smplh": "SMPL-H: the folder of its files, npz or pkl, from https://mano.is.tue.mpg.de (register)",
-}
-
-
-def add_list(one: argparse.ArgumentParser) -> None:
-    one.add_argument("name", nargs="?", help="the data set to tell of; default: all")
-
-
-def run_list(given: argparse.Namespace) -> int:
-    answers.show(f"data list {given.name or ''}", lambda console: draw_list(console, given.name))
-    return 0
-
-
-def draw_list(console: Console, name: str | None) -> bool:
-    """Print all data sets, or one in full. -> whether the same call will print the same again"""
-    from magnet.datamodules import registry
-    from magnet.plugins import told
-
-    if name:
-        for entry in registry.unprepared():
-            if entry.name.lower() == name.lower():
-                show_data(console, entry)
-                return True
-        show_reader(console, registry.reader(name))
-        return True
-    for kind in registry.readers().values():
-        show_reader(console, kind)
-    for entry in registry.unprepared():
-        show_data(console, entry)
-    for lost in registry.failures():
-        console.print(f"[bold red]{lost.name}[/]  of {lost.origin}", soft_wrap=True, highlight=False)
-        show(console, "failed to load", told(lost.error))
-    return not registry.failures()
-
-
-def show_reader(console: Console, kind: type[Reader]) -> None:
-    """A data set whose download is prepared."""
-    from magnet.datamodules import registry
-
-    console.print(f"[bold cyan]{kind.name}[/]  {kind.title}", soft_wrap=True)
-    show(console, "who may use it", kind.licence)
-    show(console, "where to ask", kind.source)
-    wide = max((len(pattern) for pattern, _ in kind.layout), default=0)
-    for number, (pattern, what) in enumerate(kind.layout):
-        show(console, "" if number else "under --root", f"{pattern:<{wide}}  {what}")
-    family = next(iter(kind.shapes_of), kind.family)
-    body = BODIES.get(family, "")
-    model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
-    show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
-    if not body:  # the open one will do, which is the shipped model's
-        show(console, "", f"magnet fit --config {TUNING} --data.path STORE   # {WHERE_CONFIGS}")
-    show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
-    if body:
-        show(console, "", WHERE[family])
-    if kind.fake:
-        show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
-
-
-def show_data(console: Console, entry: Registered) -> None:
-    """A data set that trains without being prepared."""
-    from magnet.datamodules import registry
-
-    console.print(f"[bold cyan]{entry.name}[/]  of {entry.origin}", soft_wrap=True)
-    show(console, "what it is", (entry.kind.__doc__ or "").strip().partition("\n")[0])
-    show(console, "then", registry.fit_command(entry.name))
-
-
-def show(console: Console, what: str, text: str) -> None:
-    """A line of it, as it is."""
-    from rich.text import Text
-
-    console.print(Text.assemble((f"  {what:<16}", "dim"), text), soft_wrap=True)
 
 
 def show_splits(splits: Mapping[str, Mapping[str, Any]], title: str | None = None) -> None:
     """The table of splits, as a store's manifest has them, with the number of shards where there are any."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from magnet.datamodules.clip import SPLITS
-    from magnet.motion.scene import FPS
-
     shards = ["shards"] if any("shards" in split for split in splits.values()) else []
     heads = ("split", "takes", "clips", "frames", "minutes", *shards)
     table = Table(*heads, title=title, title_justify="left", header_style="bold")
@@ -127,14 +42,6 @@ def show_splits(splits: Mapping[str, Mapping[str, Any]], title: str | None = Non
     Console().print(table)
 
 
-def show_some(lines: Sequence[str], most: int, more: str, file: TextIO | None = None) -> None:
-    """Print the first `most` lines, and how many more there are."""
-    for line in lines[:most]:
-        print(line, file=file)
-    if len(lines) > most:
-        print(f"  ... and {len(lines) - most} more{more}", file=file)
-
-
 def show_skipped(skipped: list[tuple[str, str]]) -> None:
     """Takes that were not used, and why."""
     if skipped:
@@ -145,8 +52,6 @@ def show_skipped(skipped: list[tuple[str, str]]) -> None:
 
 def show_gaps(splits: Mapping[str, Mapping[str, Any]], limited: bool = False) -> None:
     """Warn of what the splits lack, on the error stream; `limited`: not all takes were asked for."""
-    from magnet.datamodules.preparing.check import split_gaps
-
     clips: Any = {split: {int(n): k for n, k in of["clips by people"].items()} for split, of in splits.items()}
     for line in split_gaps(clips, limited):
         print(f"WARNING: {line}", file=sys.stderr)
@@ -195,9 +100,6 @@ def training_commands(name: str, out: str, body: str, longest: int) -> list[str]
 
     longest: frames of the longest test clip.
     """
-    from magnet.datamodules import registry
-    from magnet.datamodules.options import HELD_OUT
-
     place = f"--data.path {shlex.quote(str(out))}"
     usual = f"{registry.fit_command(registry.data_of(registry.reader(name)))} {place}"
     if body != "open":
@@ -209,16 +111,10 @@ def training_commands(name: str, out: str, body: str, longest: int) -> list[str]
 
 def shorter_tests(longest: int, horizon: int) -> str:
     """The option without which no test scene would fit into the longest test clip, for a command; "" where some do."""
-    from magnet.datamodules.options import HELD_OUT
-
     rest = longest - HELD_OUT.context_frames
     return f" --data.test.horizon_frames {rest}" if 0 < rest < horizon else ""
 
 
 def file_bars() -> AbstractContextManager[Tell]:
     """A progress bar of the file that is being fetched."""
-    from rich.progress import DownloadColumn, TransferSpeedColumn
-
-    from magnet.datamodules.preparing.progress import bar_with
-
     return bar_with(DownloadColumn(), TransferSpeedColumn())

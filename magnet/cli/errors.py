@@ -7,6 +7,7 @@ import errno
 import os
 import re
 from collections.abc import Sequence
+from typing import TextIO
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LOST = r"(?i)gloo|nccl|connection (reset|closed|refused)|remote process"
@@ -27,6 +28,14 @@ def no_such(what: str, name: str, known: Sequence[str] | dict[str, str], more: s
     others = f"there are {', '.join(known)}." if known else "there are none."
     hint = f"did you mean {close[0]}?" if close else others
     return f"no {what} {name}; {hint} See {more}"
+
+
+def show_some(lines: Sequence[str], most: int, more: str, file: TextIO | None = None) -> None:
+    """Print the first `most` lines, and how many more there are."""
+    for line in lines[:most]:
+        print(line, file=file)
+    if len(lines) > most:
+        print(f"  ... and {len(lines) - most} more{more}", file=file)
 
 
 def explain(error: Exception) -> str | None:

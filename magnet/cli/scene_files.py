@@ -30,25 +30,15 @@ OF_FILES = (
 RECORDED = (".npz", ".bvh")
 """Suffixes that files to read mostly have; a .glb or .csv behind --out, which can be read as well, is mostly written
 again."""
-IN_FPS: dict[str, Any] = {"type": float, "metavar": "FPS", "help": "frames a second of .npz, .pkl, .csv without it"}
-"""An option of commands that read files."""
-START: dict[str, Any] = {
-    "type": int,
-    "default": 0,
-    "metavar": "FRAME",
-    "help": "first frame of the files that is read, from 0",
-}
-END: dict[str, Any] = {
-    "type": int,
-    "metavar": "FRAME",
-    "help": "frame of the files before which reading ends (default: all)",
-}
-"""Options that choose a part of what commands read, counted at the file's own rate."""
+STYLES = ("body", "light", "capsules", "skeleton")
+"""How people are drawn."""
 PEOPLE: dict[str, Any] = {"type": int, "action": "append", "default": [], "metavar": "N"}
 """An option that names a person, and may be repeated."""
 CONTEXT, FUTURE = 32, 150
 """Frames that `magnet predict` gives of everybody, a second as in the tests of tasks, and frames that it samples where
 nothing recorded is read: where nothing is said."""
+WATCHED_STEPS = 10
+"""Denoising steps of `magnet view` where nothing is said: quick enough to watch."""
 MOMENTS, SAME_PLACE = 30, 0.02
 """Frames that are looked at, and metres between pelvises in all of them that no two bodies leave each other."""
 OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says what"}
@@ -57,12 +47,8 @@ OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> PlainParser:
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
-    options.add_argument(
-        "inputs",
-        nargs=inputs,
-        metavar="IN",
-        help="a .npz, .pkl, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people",
-    )
+    files = "a .npz, .pkl, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people"
+    options.add_argument("inputs", nargs=inputs, metavar="IN", help=files)
     return options
 
 
@@ -70,8 +56,14 @@ def add_body(options: Options) -> None:
     """--body, --trim, --start and --end, which say how files become one scene, and what of them."""
     options.add_argument("--body", metavar="FILE", help="SMPL-X npz the shapes belong to (default: the open body)")
     options.add_argument("--trim", action="store_true", help="cut people of different lengths to the shortest")
-    options.add_argument("--start", **START)
-    options.add_argument("--end", **END)
+    add_cut(options)
+
+
+def add_cut(options: Options) -> None:
+    """--start and --end, which choose a part of what is read, counted at the file's own rate."""
+    first, end = "first frame of the files that is read, from 0", "frame of the files before which reading ends"
+    options.add_argument("--start", type=int, default=0, metavar="FRAME", help=first)
+    options.add_argument("--end", type=int, metavar="FRAME", help=f"{end} (default: all)")
 
 
 def require_no_files_meant(arguments: Sequence[str]) -> None:
@@ -96,10 +88,10 @@ def require_files_to_cut(inputs: Sequence[str], start: int, end: int | None) -> 
 
 def add_origin(options: Options) -> None:
     """--in_fps, --in_unit, --up, --keep_floor and --joint, for files of other programs."""
-    options.add_argument("--in_fps", **IN_FPS)
-    options.add_argument(
-        "--in_unit", metavar="UNIT", help="m, cm, mm, inch or foot (default: by the length of legs; of .npz m)"
-    )
+    fps = "frames a second of .npz, .pkl, .csv without it"
+    options.add_argument("--in_fps", type=float, metavar="FPS", help=fps)
+    unit = "m, cm, mm, inch or foot (default: by the length of legs; of .npz m)"
+    options.add_argument("--in_unit", metavar="UNIT", help=unit)
     options.add_argument("--up", help="x, y, z, or --up=-z (default: where torsos point)")
     options.add_argument("--keep_floor", action="store_true", help="keep people at the height they were recorded at")
     options.add_argument("--clip", metavar="NAME", help="animation of a .glb that is read (default: the first)")
@@ -127,8 +119,7 @@ def reading(options: argparse.Namespace, fps: float | None = None) -> Reading:
 
 def add_look(options: Options) -> None:
     """--style and --size, of films and other pictures."""
-    styles = ("body", "light", "capsules", "skeleton")
-    options.add_argument("--style", choices=styles, default="body", help="of people; light: a body of few triangles")
+    options.add_argument("--style", choices=STYLES, default="body", help="of people; light: a body of few triangles")
     size = "pixels of a film's panel (640 480)"
     options.add_argument("--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help=size)
 

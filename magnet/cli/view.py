@@ -6,17 +6,11 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
-from magnet.cli.named_files import require_there
-from magnet.errors import counted
 from magnet.sampling.presets import PRESETS, preset_name
-
-if TYPE_CHECKING:
-    from magnet.export.read_options import Reading
 
 GOES_WITH = {
     **dict.fromkeys(("ckpt_path", "task", "sampler", "steps", "seed"), "--live or --record"),
@@ -26,12 +20,8 @@ GOES_WITH = {
 """Options of a model that generates, and the option that lets it."""
 NOT_LIVE = ("html", "truth", "context", "samples")
 """Options of files that are only shown."""
-STEPS = 10
-"""Denoising steps where nothing is said: quick enough to watch."""
 MOST_FRAMES = 1_000_000
 """That --record adds."""
-EXAMPLE = "duet"
-"""Scene that a live model goes on from where nothing is said: its couple stays together (docs/viewer.md)."""
 
 EXAMPLES = """\
 examples:
@@ -53,16 +43,15 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
     files = "scenes (.npz), SMPL-X motion (.npz, .pkl), recordings of denoising, .bvh, .glb, .gltf, .vrma, .fbx, .csv"
     parser.add_argument("files", nargs="*", metavar="FILE", help=files)
-    add = parser.add_argument_group("what is shown").add_argument
+    shown = parser.add_argument_group("what is shown")
+    add = shown.add_argument
     add("--truth", metavar="FILE", help="a scene to show as ghosts in each of the others (default: none)")
     context = "first frames, from --start on, that a model was given, in files that do not say"
     add("--context", type=int, default=0, metavar="N", help=context)
     add("--samples", type=int, default=4, metavar="N", help="scenes of one file shown (default: 4)")
     add("--body", metavar="MODEL.npz", help="your own SMPL-X model, for scenes that belong to it")
-    add("--start", **scene_files.START)
-    add("--end", **scene_files.END)
-    styles = ("body", "light", "capsules", "skeleton")
-    add("--style", choices=styles, help="default: body, light for crowds")
+    scene_files.add_cut(shown)
+    add("--style", choices=scene_files.STYLES, help="default: body, light for crowds")
     add("--no_shadows", action="store_true", help="discs instead: much faster where the browser has no GPU")
     add("--html", metavar="OUT.html", help="write a self-contained page that plays everything, and stop")
     scene_files.add_origin(parser.add_argument_group("reading files of other programs"))
@@ -75,7 +64,8 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     add("--task", default="joint_future", help="task to begin with (default: %(default)s)")
     add("--people", type=int, metavar="N", help="people to generate from nothing (default: an example couple)")
     add("--sampler", type=preset_name, metavar="PRESET", help=f"how to sample: {' or '.join(PRESETS)}")
-    add("--steps", type=int, metavar="N", help=f"denoising steps (default: {STEPS}, or those of --sampler)")
+    steps = f"denoising steps (default: {scene_files.WATCHED_STEPS}, or those of --sampler)"
+    add("--steps", type=int, metavar="N", help=steps)
     add("--seed", type=int, default=1, help="seed of the sampling (default: %(default)s)")
     add = parser.add_argument_group("where").add_argument
     add("--port", type=int, default=8080, help="0: any that is free (default: %(default)s)")
@@ -100,9 +90,16 @@ def main(arguments: Sequence[str]) -> int:
         options.record = str(suffixed(options.record, ".npz"))  # as it is written, and read again to be shown
     for out in filter(None, (options.html, options.record)):
         require_place(out)
+    if options.html is None:
+        from magnet.viewer.server import free_port, require_viser
+
+        require_viser()
+        free_port(options.host, options.port)  # before reading and loading, which may take long
+    from magnet.cli import view_shown
+
     if options.html is not None:
-        return _write_page(options)
-    stage = _live(options) if options.live else _watch(options)
+        return view_shown.write_page(options)
+    stage = view_shown.live_app(options) if options.live else view_shown.viewer(options)
     announce(stage.port, options.host, options.no_browser)
     try:
         stage.run()
@@ -158,147 +155,3 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"--frames {options.frames}: expected 1 to {MOST_FRAMES:,}")
     if options.context < 0 or options.samples < 1:
         raise ValueError(f"--context {options.context} --samples {options.samples}: expected at least 0 and 1")
-
-
-def _how_read(options: argparse.Namespace) -> tuple[Reading, Reading]:
-    """How FILEs and --truth are read."""
-    from magnet.export.reading import shared
-
-    files, truth = shared(
-        scene_files.reading(options), options.files, [options.truth] if options.truth else options.files
-    )
-    return files, truth
-
-
-def _read(options: argparse.Namespace) -> tuple[list[Any], Any]:
-    from magnet.body.base import load_body
-    from magnet.viewer.takes import read_takes
-
-    require_there(options.files)
-    body = load_body(options.body or "open")
-    how, _ = _how_read(options)
-    takes, body = read_takes(options.files, body, options.context, options.samples, how, print)
-    longest = max(each.scene.frames for each in takes)
-    if options.context > longest:
-        raise ValueError(f"--context {options.context}: got {counted(longest, 'frame')}; give {longest} or less")
-    return takes, body
-
-
-def _truth(options: argparse.Namespace, body: Any, fps: float) -> Any:
-    """The first scene of --truth, or None."""
-    from magnet.viewer.takes import read_takes
-
-    if not options.truth:
-        return None
-    _, how = _how_read(options)
-    truth = read_takes([options.truth], body, 0, 1, how, lambda note: print(f"--truth: {note}"))[0][0]
-    if abs(truth.scene.fps - fps) > 1e-3:
-        raise ValueError(f"--truth has {truth.scene.fps:g} frames a second, the scenes {fps:g}: magnet export --fps")
-    return truth
-
-
-def _write_page(options: argparse.Namespace) -> int:
-    from magnet.export.page.html import save_html
-
-    takes, body = _read(options)
-    truth = _truth(options, body, takes[0].scene.fps)
-    styles = (options.style,) if options.style else None
-    path = save_html(takes, options.html, body, truth=None if truth is None else truth.scene, styles=styles)
-    print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    return 0
-
-
-def _watch(options: argparse.Namespace) -> Any:
-    from magnet.viewer.server import free_port, require_viser
-    from magnet.viewer.takes import read_takes
-    from magnet.viewer.watch import Viewer, default_render_options
-
-    require_viser()
-    free_port(options.host, options.port)  # before reading, which may take long
-    takes, body = _read(options)
-    if options.record is not None:
-        _record(options, takes[0].scene)
-        takes, _ = read_takes([options.record], body, options.context)
-    truth = _truth(options, body, takes[0].scene.fps)
-    render = default_render_options(takes, options.style, not options.no_shadows)
-    return Viewer(takes, body, truth, options.host, options.port, render)
-
-
-def _record(options: argparse.Namespace, scene: Any) -> None:
-    import torch
-
-    from magnet.cli.kept_checkpoints import checkpoint_of
-    from magnet.denoiser.core import DenoiserCore
-    from magnet.generation.trace import record
-    from magnet.motion.tokens import TOKEN_FRAMES
-    from magnet.sampling.grid import Grid
-    from magnet.tasks import registry
-    from magnet.tasks.base import schedule_of
-
-    task = registry.get(options.task)()
-    given = options.context // TOKEN_FRAMES
-    try:  # before a model is loaded
-        schedule_of(task, Grid(given + max(options.frames // TOKEN_FRAMES, 1), scene.agents, given))
-    except ValueError as error:
-        raise ValueError(f"--record, of which --context {options.context} frames are given: {error}") from error
-    model = DenoiserCore.load(checkpoint_of(options.ckpt_path))
-    scene_files.say_other_body(model, scene.body)
-    generator = torch.Generator().manual_seed(options.seed)
-    sampler = sampler_options(options)
-    recording = record(model, scene, task, options.context, options.frames, sampler, generator)
-    print(f"written: {recording.save(options.record)}")
-
-
-def sampler_options(options: argparse.Namespace) -> Any:
-    """How to sample, as --sampler and --steps say."""
-    from magnet.sampling.options import SamplerOptions
-
-    steps = STEPS if options.sampler is None and options.steps is None else options.steps
-    said: dict[str, Any] = {} if steps is None else {"steps": steps}
-    if options.live and options.sampler is None:  # live partners are not settled, and keep apart at least
-        said["apart"] = "light"
-    return SamplerOptions.preset(options.sampler or "default", **said)
-
-
-def _live(options: argparse.Namespace) -> Any:
-    from magnet.viewer.server import free_port, require_viser
-
-    require_viser()
-    free_port(options.host, options.port)
-    import torch
-
-    from magnet import checkpoints
-    from magnet.body.base import load_body
-    from magnet.body.floor import open_body
-    from magnet.cli.kept_checkpoints import checkpoint_of
-    from magnet.denoiser.core import DenoiserCore
-    from magnet.generation.live import Live
-    from magnet.motion.scene import Scene
-    from magnet.tasks import registry
-    from magnet.viewer.live_app import LiveApp
-    from magnet.viewer.scene_view import RenderOptions
-
-    registry.get(options.task)
-    folder = checkpoints.FOLDER / "duet" / "scenes"
-    body = load_body(options.body or "open")
-    start, began = None, None
-    if options.files:
-        takes, body = _read(options)
-        start = takes[0].scene
-    own = body.id != open_body().id  # no example has it
-    examples = {} if own else {path.stem: path for path in sorted(folder.glob("*.npz"))}
-    if start is None and options.people is None and examples:
-        start, began = Scene.load(examples[EXAMPLE]), EXAMPLE
-    model = DenoiserCore.load(checkpoint_of(options.ckpt_path))
-    scene_files.say_other_body(model, body.id)
-    live = Live(
-        model,
-        2 if options.people is None else options.people,
-        start,
-        generator=torch.Generator().manual_seed(options.seed),
-        body=body.id,
-    )
-    live.settings.task, live.settings.sampler = options.task, sampler_options(options)
-    live.settings.steps, live.settings.guidance = live.settings.sampler.steps, live.settings.sampler.guidance
-    render = RenderOptions(style=options.style or "body", shadows=not options.no_shadows)
-    return LiveApp(live, body, options.host, options.port, render, examples=examples, example=began)

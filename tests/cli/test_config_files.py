@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from magnet import cli
-from magnet.cli import config_files, demo, train, view
+from magnet.cli import config_files, demo, train, view, view_shown
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from tests.cases import some_slow
@@ -132,7 +132,7 @@ def test_help_names_the_presets(toy: Path, capsys: pytest.CaptureFixture[str]) -
     ],
 )
 def test_the_viewer_samples_as_it_is_told(words: tuple[str, ...], expected: SamplerOptions) -> None:
-    assert view.sampler_options(view.arguments_of(["--live", *words])) == expected
+    assert view_shown.sampler_options(view.arguments_of(["--live", *words])) == expected
 
 
 def test_the_demo_takes_a_preset_and_its_steps() -> None:

@@ -128,7 +128,7 @@ def test_a_check_of_a_store_refuses_options_that_would_change_nothing(made, caps
 def test_an_up_axis_may_be_said_as_for_export(said, up):
     given = data.command_parser("check").parse_intermixed_args(["dl", *said])
     given.reader_options = []
-    assert data.job_of(given, "bvh", "dl").canonicalize.up == up
+    assert data_options.job_of(given, "bvh", "dl").canonicalize.up == up
 
 
 def test_tests_that_would_not_fit_into_the_takes_are_made_shorter_in_the_command(tmp_path, capsys):
@@ -256,9 +256,9 @@ def test_an_empty_split_is_said_loudly(copy, capsys, command):
 
 @pytest.mark.parametrize("command", data.COMMANDS)
 def test_names_and_folders_may_stand_before_between_and_after_options(command, monkeypatch):
-    add, _, what = data.COMMANDS[command]
+    add, _ = data.COMMANDS[command]
     seen = []
-    monkeypatch.setitem(data.COMMANDS, command, (add, lambda given: seen.append(given) or 0, what))
+    monkeypatch.setattr(data, "run_of", lambda name: lambda given: seen.append(given) or 0)
     one = argparse.ArgumentParser()
     add(one)
     places = [f"place{k}" for k, action in enumerate(a for a in one._actions if not a.option_strings)]

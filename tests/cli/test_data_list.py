@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from magnet.cli.data_shown import draw_list
+from magnet.cli.data_list import draw_list
 from magnet.datamodules import registry
 from tests.cases import few
 

@@ -11,7 +11,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.body.contact import depth_between, overlaps
-from magnet.cli.refine import curves, drawn, told
+from magnet.cli.refine_shown import curves, drawn, told
 from magnet.motion.scene import Scene, concatenate, empty_scene
 from magnet.synthesis import synthesize
 

@@ -11,7 +11,8 @@ import torch
 from magnet import checkpoints
 from magnet.body import Body
 from magnet.cli import main, view
-from magnet.cli.view import arguments_of, sampler_options
+from magnet.cli.view import arguments_of
+from magnet.cli.view_shown import sampler_options
 from magnet.datamodules.fakes.body import write_body
 from magnet.export import save_bvh
 from magnet.export.drawing import STYLES
