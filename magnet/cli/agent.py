@@ -46,11 +46,8 @@ def parser() -> argparse.ArgumentParser:
     add("--task", choices=("agentic_sync", "agentic_async"), default="agentic_sync", help="in step, or in turns")
     add("--model", default=None, metavar="NAME", help="shipped model or checkpoint")
     add("--steps", type=int, default=4, help="denoising steps (default: %(default)s)")
-    add(
-        "--settle",
-        choices=("off", "light", "firm", "hold"),
-        help="correct poses (default: as the model is best sampled)",
-    )
+    settle = "correct poses (default: as the model is best sampled)"
+    add("--settle", choices=("off", "light", "firm", "hold"), help=settle)
     add("--precision", default=None, help="reference, float32, bf16 or int8 (default: the sampler's)")
     add("--seed", type=int, default=0, help="of the noise, the same for all (default: %(default)s)")
     add("--play", metavar="FILE", help="play the motion in this file instead of generating any")

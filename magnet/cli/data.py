@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from magnet.cli import answers
-from magnet.cli.data_options import besides_reader_options, reader_parser
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser
 
@@ -30,13 +29,7 @@ Prepare, check, describe, fake and download data sets.
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`magnet data ...`. Returns the exit code.
-
-    Raises:
-        CommandError: no such command.
-        ValueError: a data set, option or folder that does not fit; says what does.
-        OSError: a folder or disk that cannot be used.
-    """
+    """`magnet data ...`. Returns the exit code."""
     command, *words = arguments or ["--help"]
     if command in ("-h", "--help"):
         parser().print_help()
@@ -82,16 +75,25 @@ def show_help(command: str, given: argparse.Namespace) -> int:
     """Help of a command, with a data set's own options where one is named."""
     given.parser.print_help()
     if command in ("prepare", "check") and given.name:
-        print(answers.kept(f"data prepare {given.name} help", lambda: reader_help(given.name)), end="")
+
+        def options() -> str:
+            from magnet.cli.data_options import reader_help
+
+            return reader_help(given.name)
+
+        print(answers.kept(f"data prepare {given.name} help", options), end="")
     return 0
 
 
-def reader_help(name: str) -> str:
-    """Options of a data set's own; nothing where there is no such data set."""
-    from magnet.datamodules import registry
-
-    kind = registry.readers().get(name)
-    return "" if kind is None else f"\noptions of {kind.title}:\n\n{reader_parser(kind).format_help()}"
+def besides_reader_options(words: Sequence[str]) -> list[str]:
+    """Words that belong to no `--reader.OPTION VALUE` or `--reader.OPTION=VALUE`."""
+    found, takes_values = [], False
+    for word in words:
+        if word.startswith("--"):
+            takes_values = word.startswith("--reader.") and "=" not in word
+        if not takes_values and not word.startswith("--reader."):
+            found.append(word)
+    return found
 
 
 def run_of(command: str) -> Callable[[argparse.Namespace], int]:

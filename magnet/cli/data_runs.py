@@ -38,11 +38,7 @@ FAILED = 1
 
 
 def needed(given: argparse.Namespace, *names: str) -> list[str]:
-    """Values that must be there.
-
-    Raises:
-        ValueError: one is not.
-    """
+    """Values that must be there."""
     for action in given.parser._actions:
         if action.dest in names and getattr(given, action.dest) is None:
             name, prog = "".join(action.option_strings[:1]) or action.dest, given.parser.prog
@@ -101,11 +97,7 @@ def run_check(given: argparse.Namespace) -> int:
 
 
 def picture_of(given: argparse.Namespace, name: str) -> Path | None:
-    """The picture to write, where one can be written; None: none is wanted. name: of the data set, which names it.
-
-    Raises:
-        CannotWrite: no file can be written there.
-    """
+    """The picture to write, where one can be written; None: none is wanted. name: of the data set, which names it."""
     if given.picture == "none":
         return None
     picture = Path(given.picture or f"{name}_check.png")

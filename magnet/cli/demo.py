@@ -24,9 +24,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--ckpt_path", default=None, help="another model (default: the one in the package)")
     options.add_argument("--scenes", type=int, default=9, help="test scenes to score (default: %(default)s)")
     options.add_argument("--samples", type=int, default=4, help="samples per scene (default: %(default)s)")
-    options.add_argument(
-        "--sampler", type=preset_name, default="default", help=f"{' or '.join(PRESETS)}: how to sample"
-    )
+    presets = f"{' or '.join(PRESETS)}: how to sample"
+    options.add_argument("--sampler", type=preset_name, default="default", help=presets)
     options.add_argument("--steps", type=int, default=None, help="denoising steps; default: the sampler's")
     options.add_argument("--minute", type=int, default=None, help="frames of the long scene (default: a minute)")
     return options

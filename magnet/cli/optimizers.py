@@ -19,8 +19,6 @@ from magnet.cli.parser import option
 
 KEYS = {"optimizer": "its AdamW", "lr_scheduler": "a warm-up and a cosine"}
 """Options, and what a model does without them (`magnet.training.optim`)."""
-
-
 MADE_WITH = "magnet_optimizer"
 """Key of a checkpoint: the class of its optimizer, whose state torch would give to any other."""
 FIELDS = "magnet_optimizer_fields"
@@ -89,11 +87,7 @@ def plain(chosen: Namespace | dict[str, Any]) -> dict[str, Any]:
 
 
 def optimizer_of(configured: Any) -> Optimizer:
-    """The optimizer among what `configure_optimizers` may return.
-
-    Raises:
-        ValueError: there is none, or there are several.
-    """
+    """The optimizer among what `configure_optimizers` may return."""
     if isinstance(configured, dict):
         configured = configured["optimizer"]
     while isinstance(configured, (list, tuple)) and len(configured) and not isinstance(configured, Optimizer):

@@ -22,11 +22,8 @@ from magnet.motion.scene import Scene
 
 PANELS = 4
 """Samples that a moving picture shows side by side."""
-
-
 FACTS = ("task", "benchmark", "checkpoint", "samples", "seed", "context frames", "horizon frames")
 """What scenes.json, too, says of a run."""
-
 WIDE = 100
 """Columns that a table may have where it is written to no screen."""
 

@@ -45,27 +45,13 @@ tasks and their options: magnet tasks;  --sampler.FIELD: magnet predict --help s
 without files, people or this help's name, magnet predict samples a data set: magnet predict --help
 """
 
-
 OF_EXPORT = (
-    "--fps",
-    "--names",
-    "--root",
-    "--clips",
-    "--rig",
-    "--rig_joint",
-    "--unit",
-    "--smplx",
-    "--each",
-    "--on_floor",
-    "--person",
-    "--title",
+    *("--fps", "--names", "--root", "--clips", "--rig", "--rig_joint"),
+    *("--unit", "--smplx", "--each", "--on_floor", "--person", "--title"),
 )
 """Options of `magnet export`, which writes what was predicted in other ways."""
-
 OF_DATA_SETS = ("--config", "--data", "--model", "--trainer", "--baselines")
 """Options of `magnet predict` without files, which samples a data set."""
-
-
 COUNTS = {"frames": (1, 1_000_000), "context": (0, 1_000_000), "samples": (1, 10_000)}
 """The least and the most that is taken; more, nine hours of motion, is a slip."""
 
@@ -218,11 +204,7 @@ def files_of(folder: Path) -> str:
 
 
 def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
-    """The people of all files, or a scene of nobody, and its body.
-
-    Raises:
-        ValueError, OSError: as `magnet.export.reading.read`.
-    """
+    """The people of all files, or a scene of nobody, and its body."""
     import torch
 
     from magnet.body import load_body

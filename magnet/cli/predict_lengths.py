@@ -25,10 +25,6 @@ def lengths(
     """What is read of the files, its frames that are given of everybody, and frames after them.
 
     A task that reads nothing of the recording after its context goes on from the end, so that nothing is thrown away.
-
-    Raises:
-        CommandError: the task reads motion that was not recorded.
-        ValueError: the task makes no sense at these sizes.
     """
     crowd = scene.agents > model.most_people and choice.name != "generation"
     nothing = bool(added) or not (options.inputs or crowd)

@@ -29,9 +29,8 @@ def parser() -> argparse.ArgumentParser:
     add("name", metavar="NAME", help="of the model, and of its folder")
     add("--trained_on", metavar="TEXT", help="which data; needed unless they are those of configs/duet_*.yaml")
     add("--licence", metavar="TEXT", help="of the weights; needed where other data went into them, else Apache-2.0")
-    add(
-        "--folder", type=Path, default=Path(), metavar="FOLDER", help="where the model's folder is made (default: here)"
-    )
+    folder = "where the model's folder is made (default: here)"
+    add("--folder", type=Path, default=Path(), metavar="FOLDER", help=folder)
     add("--decoder", type=Path, metavar="FILE", help="checkpoint of a tokenizer trained on with decoder_only")
     return options
 

@@ -51,8 +51,7 @@ def about(
     known, all_known = ours(own), ours(own) and all(map(ours_of, before))
     require_said(known, all_known, trained_on, licence)
     everything = [own, *(each.get("data") or [] for each in before)]
-    parts = {part: TRAINED_ON[part] for part in TRAINED_ON if any(part in parts_of(each) for each in everything)}
-    mine = parts if all_known else {part: TRAINED_ON[part] for part in TRAINED_ON if part in parts_of(own)}
+    mine = in_our_words(*everything) if all_known else in_our_words(own)
     record: dict[str, Any] = {"trained on": trained_on or mine}
     if not trained_on and {COUPLE, SINGLES} & mine.keys():
         record["recordings"] = manifest(SINGLES in mine)
@@ -110,6 +109,12 @@ def parts_of(data: Any) -> set[str]:
     return {SYNTHETIC} if name == "Synthetic" else parts_of(said["data"])
 
 
+def in_our_words(*data: Any) -> dict[str, str]:
+    """The parts of `TRAINED_ON` that data configurations hold, with what is held out."""
+    parts = set().union(*map(parts_of, data))
+    return {part: takes for part, takes in TRAINED_ON.items() if part in parts}
+
+
 def cmu(data: Any) -> bool:
     """Whether a data configuration holds CMU's recordings, whichever takes of them, also in a prepared store."""
     if isinstance(data, dict):
@@ -123,7 +128,7 @@ def passed_on(source: dict[str, Any]) -> dict[str, Any]:
     said = {key: value for key, value in source.items() if key != "data"} | {"name": without_folders(source["name"])}
     data = source.get("data") or []
     if ours(data):
-        said |= {"trained on": {part: TRAINED_ON[part] for part in TRAINED_ON if part in parts_of(data)}}
+        said |= {"trained on": in_our_words(data)}
     elif data:
         said |= {"data": without_folders(data)}
     elif "trained on" not in said:

@@ -31,13 +31,8 @@ def parser() -> argparse.ArgumentParser:
     options = PlainParser("report", __doc__, EPILOG)
     add = options.add_argument
     add("tables", nargs="+", metavar="TABLE", help="which")
-    add(
-        "--out",
-        type=Path,
-        default=Path("runs/report"),
-        metavar="FOLDER",
-        help="folder for cells and page (default: %(default)s)",
-    )
+    out = "folder for cells and page (default: %(default)s)"
+    add("--out", type=Path, default=Path("runs/report"), metavar="FOLDER", help=out)
     budgets = ("tiny", "evening", "small", "paper")
     add("--budget", choices=budgets, default="small", help="of every cell (default: %(default)s)")
     add("--ckpt_path", default="duet", metavar="MODEL", help="weights of our row (default: %(default)s)")
@@ -45,13 +40,8 @@ def parser() -> argparse.ArgumentParser:
     add("--configs", type=Path, default=Path("configs/report"), help="of trainings (default: %(default)s)")
     add("--shipped", action="store_true", help="leave out rows that would have to be trained")
     add("--dry_run", action="store_true", help="list the cells and what they may take, and stop")
-    add(
-        "--only",
-        nargs="+",
-        action="extend",
-        metavar="TEXT",
-        help="run only cells whose name holds one of these, and what these need",
-    )
+    only = "run only cells whose name holds one of these, and what these need"
+    add("--only", nargs="+", action="extend", metavar="TEXT", help=only)
     skip = "leave cells for later whose name holds one of these, and what needs a training of them that is not done"
     add("--skip", nargs="+", action="extend", default=[], metavar="TEXT", help=skip)
     add("--page_only", action="store_true", help="write the page from what is done")

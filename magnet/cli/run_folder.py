@@ -84,11 +84,7 @@ def with_checkpoint(settings: Any, command: str, checkpoint: Path | None) -> Any
 
 
 def require_folder(folder: Path) -> None:
-    """Refuse a run's folder that cannot be made or written, before loggers, which say less of it, begin.
-
-    Raises:
-        CannotWrite: it is such a one.
-    """
+    """Refuse a run's folder that cannot be made or written, before loggers, which say less of it, begin."""
     if first_process():
         require_place(folder / "run.json")
 

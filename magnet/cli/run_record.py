@@ -78,11 +78,7 @@ class Record(Callback):
         self.goes_on, self.command, self.begun = goes_on, command, False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Take the first process's folder: each names one by its own clock.
-
-        Raises:
-            CannotWrite: it cannot be written.
-        """
+        """Take the first process's folder: each names one by its own clock."""
         self.folder = Path(trainer.strategy.broadcast(str(self.folder)))
         if trainer.is_global_zero and not getattr(trainer, "fast_dev_run", False):
             require_place(self.folder / "run.json")  # before anything is sampled

@@ -192,12 +192,7 @@ def slots_of(scene: Scene) -> list[list[int]]:
 
 
 def read_inputs(options: argparse.Namespace, reading: Reading) -> Read:
-    """The scenes of all IN; what was noted on the way is printed.
-
-    Raises:
-        CommandError: there are no scenes, or a file is named twice.
-        ValueError: files that cannot be read; says what to do.
-    """
+    """The scenes of all IN; what was noted on the way is printed."""
     from magnet.export.reading import read
 
     require_there(options.inputs)

@@ -39,11 +39,7 @@ class TaskChoice:
 
     @property
     def task(self) -> Task:
-        """The task itself.
-
-        Raises:
-            ValueError: its fields contradict each other.
-        """
+        """The task itself."""
         return made(registry.get(self.name), self.fields)
 
     @property

@@ -171,12 +171,8 @@ class MagnetCLI(LightningCLI):
         self._default_class(parser, "data", registry.default_path())
         parser.explain("seed_everything", "N", EVERYTHING[self.command])
         parser.add_argument("--out", type=str | None, default=None, help="folder of the run; default runs/NAME/TIME")
-        parser.add_argument(
-            "--wandb",
-            type=Literal["online", "offline"] | None,
-            default=None,
-            help='also log to Weights & Biases; needs pip install "magnet-motion[wandb]"',
-        )
+        wandb = 'also log to Weights & Biases; needs pip install "magnet-motion[wandb]"'
+        parser.add_argument("--wandb", type=Literal["online", "offline"] | None, default=None, help=wandb)
         if self.command == "fit":
             optimizers.add_optimizer_arguments(parser)
             parser.link_arguments("data.init_args.max_agents", "model.init_args.max_agents")
@@ -191,24 +187,14 @@ class MagnetCLI(LightningCLI):
             parser.explain("sampler", "PRESET", f"{' or '.join(PRESETS)}, or a file; --sampler.FIELD beats it")
             parser.add_class_arguments(Evaluator, skip={"denoiser", "task", "sampler"}, instantiate=False)
         if self.command == "test":
-            parser.add_argument(
-                "--full", action="store_true", help="print all that was measured, with intervals, not the main numbers"
-            )
+            full = "print all that was measured, with intervals, not the main numbers"
+            parser.add_argument("--full", action="store_true", help=full)
         if self.command == "predict":
             parser.add_argument("--pictures", type=int, default=1, help="number of scenes to draw, from the first")
-            parser.add_argument(
-                "--picture",
-                type=Literal["mp4", "gif", "webp", "none"],
-                default="gif",
-                help='format of moving pictures; mp4 needs pip install "magnet-motion[video]"',
-            )
-            parser.add_argument(
-                "--view",
-                type=bool,
-                default=False,
-                help='open the first scenes in the browser; needs pip install "magnet-motion[view]"',
-            )
-
+            films = 'format of moving pictures; mp4 needs pip install "magnet-motion[video]"'
+            parser.add_argument("--picture", type=Literal["mp4", "gif", "webp", "none"], default="gif", help=films)
+            view = 'open the first scenes in the browser; needs pip install "magnet-motion[view]"'
+            parser.add_argument("--view", type=bool, default=False, help=view)
         known = [*parser.topics(), *(name for classes in parser.classes.values() for name in classes)]
         if parser.topic and parser.topic not in known:
             raise CommandError(no_such("help topic", parser.topic, known, f"magnet {self.command} --help"))

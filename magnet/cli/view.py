@@ -77,11 +77,7 @@ def arguments_of(words: Sequence[str]) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run `magnet view`. Returns the exit code.
-
-    Raises:
-        CommandError, ValueError, OSError, ImportError: something the user can put right; the message says what.
-    """
+    """Run `magnet view`. Returns the exit code."""
     options = arguments_of(arguments)
     _check(options)
     from magnet.files import require_place, suffixed
