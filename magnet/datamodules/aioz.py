@@ -30,9 +30,6 @@ class AIOZReader(Reader):
 
     Args:
         root: the folder with `motions_smpl`.
-
-    Raises:
-        DataError: no motions; says what was found.
     """
 
     name = "aioz"

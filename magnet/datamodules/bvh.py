@@ -20,10 +20,6 @@ class BVHReader(RigReader):
     Args:
         root: the folder.
         **kwargs: as for RigReader.
-
-    Raises:
-        DataError: no BVH files; says what was found.
-        ValueError: a line of `joints` that is no pair of names, or a pattern that is none.
     """
 
     name = "bvh"

@@ -33,9 +33,6 @@ class CHI3DReader(Reader):
     Args:
         root: the folder `chi3d`, or the one above.
         test_pairs: pairs held out for testing (ours).
-
-    Raises:
-        DataError: no such folder; says what was found.
     """
 
     name = "chi3d"

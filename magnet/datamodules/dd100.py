@@ -43,9 +43,6 @@ class DD100Reader(Reader):
         root: folder of the files, or one above it that holds data/motion/smplx/all.
         validation: False leaves the official training split whole and validation empty.
         orient: where to take the root's orientation from, should `global_orient` and `poses` say different things.
-
-    Raises:
-        DataError: there are no such files under root.
     """
 
     name = "dd100"

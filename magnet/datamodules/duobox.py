@@ -75,9 +75,6 @@ class DuoBoxReader(Reader):
         form: "auto" takes the SMPL-X fit of a take, or its skeleton, which is then fitted, if there is no SMPL-X fit.
         phases: of training, 1 to 4; the authors use 4.
         validation: False leaves the official training part whole and validation empty.
-
-    Raises:
-        DataError: neither folder is there.
     """
 
     name = "duobox"

@@ -68,9 +68,6 @@ class Embody3DReader(Reader):
             daylife come closest to its numbers.
         people: how many people a scene may have.
         good: what `missing` holds where tracking is good: 1 by the README, against the name.
-
-    Raises:
-        DataError: a section is not there.
     """
 
     name = "embody3d"

@@ -23,10 +23,6 @@ class GLBReader(RigReader):
     Args:
         root: the folder.
         **kwargs: as for RigReader.
-
-    Raises:
-        DataError: no such files; says what was found.
-        ValueError: a line of `joints` that is no pair of names, or a pattern that is none.
     """
 
     name = "glb"

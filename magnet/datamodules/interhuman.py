@@ -29,9 +29,6 @@ class InterHumanReader(Reader):
     Args:
         root: the folder with `motions`.
         fps: frame rate of the recordings; files that state another rate are refused.
-
-    Raises:
-        DataError: no motions; says what was found.
     """
 
     name = "interhuman"

@@ -36,9 +36,6 @@ class InterXReader(Reader):
         split: "official" reads splits/{train,val,test}.txt; "paper" reads `lists`, since the paper's authors split
             anew (9074, 1157 and 1157 clips).
         lists: folder of the lists for "paper": {train,val,test}.txt, .csv or _data.csv, one clip a line.
-
-    Raises:
-        DataError: no motions, or the processed .h5 alone.
     """
 
     name = "interx"

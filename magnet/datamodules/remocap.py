@@ -41,9 +41,6 @@ class ReMoCapReader(Reader):
         fits: folder of ready SMPL-X fits of both people, NUMBER.npz, .npy or .pkl with body_pose, orient, trans and
             betas, each (2, T, ..), such as ReMoS/data/Lindyhop/smplx_data_pose_prior_001; None: root's own files.
         scale: metres a unit of the csv files.
-
-    Raises:
-        DataError: no sequences.
     """
 
     name = "remocap"

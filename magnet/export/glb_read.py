@@ -98,8 +98,7 @@ class GlbRig:
 def read_rig(path: str | Path, given: Mapping[str, str] | None = None) -> GlbRig:
     """The one character of a glTF file, which need not move.
 
-    Args:
-        given: our joint's name to its own, for names that no scheme knows.
+    given: our joint's name to its own, for names that no scheme knows.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -104,8 +104,7 @@ class Naming:
 def recognised(names: Sequence[str], given: Mapping[str, str] | None = None) -> Naming:
     """The scheme that explains most of a skeleton's names.
 
-    Args:
-        given: our joint's name to theirs, if names alone do not tell; it overrides any scheme.
+    given: our joint's name to theirs, if names alone do not tell; it overrides any scheme.
 
     Raises:
         ValueError: `given` names a joint that does not exist.

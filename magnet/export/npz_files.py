@@ -68,10 +68,7 @@ def read_people(files: Sequence[Path], body: Body, options: Reading) -> list[Npz
     """Read the npz and pkl files of one scene, other programs' with the axis that suits them together.
 
     People whose frames are numbered are laid on each other by these, as `magnet data prepare` does; frames in which
-    somebody was not seen hold who was seen before, and are not valid.
-
-    Args:
-        files: one for each person, or one for all.
+    somebody was not seen hold who was seen before, and are not valid. files: one for each person, or one for all.
 
     Returns:
         Of each file everybody, or, where a pkl holds people by name, each of them.

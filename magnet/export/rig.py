@@ -68,8 +68,7 @@ def understood_together(
 ) -> list[Skeleton]:
     """Skeletons of one scene in metres, y up, with our joints; options that are None are found from the files.
 
-    Args:
-        given: our joint's name to theirs, for names that no scheme knows.
+    given: our joint's name to theirs, for names that no scheme knows.
 
     Raises:
         ValueError: unknown names, a length of legs that fits no unit, or a rest pose without a front.

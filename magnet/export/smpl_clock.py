@@ -144,13 +144,7 @@ def shared_clock(
 def require_one_beginning(where: object, begun: Mapping[str, int | None], advice: str) -> None:
     """Refuse files of different frame rates that begin with frames of different numbers: they have no common clock.
 
-    Args:
-        where: for the message.
-        begun: the number of each file's first frame, where it has one, by the file's name.
-        advice: what to do.
-
-    Raises:
-        DataError: names the files and their numbers.
+    begun: the number of each file's first frame, where it has one, by the file's name; advice: what to do.
     """
     known = {name: number for name, number in begun.items() if number is not None}
     if len(set(known.values())) > 1:

@@ -29,10 +29,6 @@ SHARED = (*RATE, "gender", SCALE, "body")
 def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Each person's arrays in a file, which holds one person, a list of people, or a dict of people by name.
 
-    Args:
-        path: the file.
-        held: what it holds.
-
     Yields:
         What to call the place in messages; and what is there: of one person, or of several along the first axis.
 

@@ -289,13 +289,7 @@ class OwnReader(Reader, Generic[T]):
 
 
 def require_alone(path: Path, people: int, alone: bool) -> None:
-    """Refuse several people in one of a scene's several files.
-
-    Args:
-        path: the file.
-        people: how many it holds.
-        alone: it is the only one of its scene.
-    """
+    """Refuse several people in one of a scene's several files. alone: it is the only one of its scene."""
     if people > 1 and not alone:
         raise DataError(
             f"{path}: holds {people} people, but other files belong to its scene, too; of several files each holds "

@@ -73,17 +73,10 @@ class PosedTrack:
 def on_one_clock(
     where: object, tracks: Sequence[PosedTrack], names: Sequence[str]
 ) -> tuple[list[PosedTrack], list[str]]:
-    """People from the frame that the last of them begins with to the one that the first of them ends with.
+    """People from the frame that the last of them begins with to the one that the first of them ends with; and notes.
 
-    Frames between these in which a person was not seen are not valid. Who has no numbers stays as they are.
-
-    Args:
-        where: the file or files, for messages.
-        tracks: their people.
-        names: of the people, for messages.
-
-    Returns:
-        The people, and what should be known of them.
+    Frames between these in which a person was not seen are not valid. Who has no numbers stays as they are. where: the
+    file or files; names: of the people; both for messages.
     """
     clock = shared_clock(where, [track.numbers for track in tracks], names)
     if clock is None:
@@ -103,15 +96,7 @@ def on_one_clock(
 
 
 def of_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tuple[list[PosedTrack], list[str]]:
-    """People of several files of one scene on the clock that their files' numbers tell, as those of one file.
-
-    Args:
-        files: of the scene.
-        tracks: the person of each.
-
-    Returns:
-        The people, and what should be known of them.
-    """
+    """People of several files, one each, on the clock that their files' numbers tell, as those of one; and notes."""
     if any(track.said_fps not in (None, track.fps) for track in tracks):
         begun = {file.name: track.first for file, track in zip(files, tracks, strict=True)}
         require_one_beginning(files[0], begun, "say when each begins, in seconds, by `start` in a table (docs/own.md)")
@@ -125,12 +110,7 @@ def of_one_beginning(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tup
 def of_own_axes(files: Sequence[Path], tracks: Sequence[PosedTrack]) -> tuple[list[PosedTrack], list[str]]:
     """People with the axis that points up in each one's file, as `magnet export` finds it: somebody may lie.
 
-    Args:
-        files: of one scene: one for each person, or one for all.
-        tracks: its people.
-
-    Returns:
-        The people; and what is said of files in which somebody lies or that have different axes.
+    Also notes on files in which somebody lies or that have different axes. files: one for each person, or one for all.
     """
     one_for_all = len(files) < len(tracks)
     ups = [standing(tracks)] * len(tracks) if one_for_all else [standing([track]) for track in tracks]

@@ -212,8 +212,7 @@ NOBODY = NOBODY.view(BYTES)
 def mirrored(body: Tensor) -> Tensor:
     """Joints' quaternions seen in the plane x = 0, left and right exchanged: `mirror_scene` on eight bytes a joint.
 
-    Args:
-        body: (..., 21, 4) int16, xyzw.
+    (..., 21, 4) int16, xyzw -> same
     """
     whole = body.view(torch.int64)[..., 0]
     swapped = whole[..., OTHER_SIDE].unsqueeze(-1).view(torch.int16)

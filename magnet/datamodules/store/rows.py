@@ -37,11 +37,7 @@ def encode(scene: Scene) -> NDArray[np.void]:
 def matrices(rotations: Tensor) -> Tensor:
     """Quaternions of any length to rotation matrices; a row comes out the same whatever it is decoded with.
 
-    Args:
-        rotations: (..., 4) int16, xyzw.
-
-    Returns:
-        (..., 3, 3) float32 on the same device.
+    (..., 4) int16, xyzw -> (..., 3, 3) float32 on the same device
     """
     flat = rotations.reshape(-1, 4)
     nine = nine_at_once(flat) if flat.device.type != "cpu" else torch.from_numpy(_nine(flat.numpy()))
