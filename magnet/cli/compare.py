@@ -6,6 +6,7 @@ import argparse
 import ast
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,37 +51,49 @@ def main(arguments: Sequence[str] = ()) -> int:
     if len(given.folders) > 2 or (len(given.folders) == 1 and not given.rows):
         many = len(given.folders)
         raise CommandError(f"got {many} folder{'s' * (many > 1)}, expected two, or one with --rows ROW ROW")
-    both = [read(folder) for folder in (given.folders[0], given.folders[-1])]
-    rows = tuple(given.rows or [next(iter(values.rows)) for _, values in both])
-    for folder, row, (_, values) in zip((given.folders[0], given.folders[-1]), rows, both, strict=True):
-        if row not in values.rows:
-            raise CommandError(no_such("row", row, list(values.rows), str(folder / "results.json")))
-    show(both[0], both[1], (rows[0], rows[1]), given.full, given.folders)
+    first, second = given.rows or (None, None)
+    show(read(given.folders[0], first), read(given.folders[-1], second), given.full)
     return 0
 
 
-def read(folder: Path) -> tuple[Results, SceneValues]:
-    """The results in a folder, and the values of their scenes."""
+@dataclass(frozen=True)
+class Side:
+    """One of the two that are compared: a row of a table, and the values of its scenes."""
+
+    folder: Path
+    results: Results
+    values: SceneValues
+    row: str
+
+    def settings(self) -> dict[str, Any]:
+        """What decides how the row came about: its task, its number of samples, and single options of sampler and
+        task."""
+        said = self.values.facts.get("samples")
+        found = {key: self.values.facts.get(key) for key in SAME}
+        found["samples"] = said.get(self.row) if isinstance(said, dict) else said
+        return found | flat(self.results.meta.get("sampler", {})) | scalars(self.results.meta.get("task options", ""))
+
+
+def read(folder: Path, row: str | None) -> Side:
+    """A row of the results in a folder, None: the first, and the values of its scenes."""
     from magnet.evaluation.by_scene import SceneValues
     from magnet.evaluation.results import Results
 
     wanted = "expected a folder that magnet test or magnet score has written"
     if not folder.exists():
         raise CommandError(f"{folder}: is not there, {wanted}")
-    folder = folder.parent if folder.suffix == ".json" else folder
+    held = folder.parent if folder.suffix == ".json" else folder
     for name in ("results.json", FILE):
-        if not (folder / name).is_file():
-            raise CommandError(f"{folder}: has no {name}, {wanted}")
-    return Results.load_json(folder / "results.json"), SceneValues.load(folder / FILE)
+        if not (held / name).is_file():
+            raise CommandError(f"{held}: has no {name}, {wanted}")
+    results, values = Results.load_json(held / "results.json"), SceneValues.load(held / FILE)
+    row = row or next(iter(values.rows))
+    if row not in values.rows:
+        raise CommandError(no_such("row", row, list(values.rows), str(folder / "results.json")))
+    return Side(folder, results, values, row)
 
 
-def show(
-    first: tuple[Results, SceneValues],
-    second: tuple[Results, SceneValues],
-    rows: tuple[str, str],
-    full: bool,
-    folders: Sequence[Path],
-) -> None:
+def show(a: Side, b: Side, full: bool) -> None:
     """Print what is compared, and the table."""
     import sys
 
@@ -90,44 +103,34 @@ def show(
     from magnet.evaluation.by_scene import compared
     from magnet.evaluation.results import REFERENCES
 
-    results, one, other = first[0], first[1], second[1]
+    one, other, results = a.values, b.values, a.results
     common = set(one.scenes) & set(other.scenes)
     if not common:
         raise CommandError(f"no common test scenes: one has {one.scenes[0]}, the other {other.scenes[0]}")
-    metrics = [metric for metric in one.rows[rows[0]] if metric in other.rows[rows[1]]]
+    metrics = [metric for metric in one.rows[a.row] if metric in other.rows[b.row]]
     metrics = [metric for metric in metrics if full or results.column(metric).main] or metrics
     if not metrics:
-        raise CommandError(f"{rows[0]} and {rows[1]} have no number in common that is a mean over scenes")
+        raise CommandError(f"{a.row} and {b.row} have no number in common that is a mean over scenes")
     units = len(
         {unit if unit >= 0 else name for name, unit in zip(one.scenes, one.units, strict=True) if name in common}
     )
-    names = (f"{rows[0]} (A)", f"{rows[1]} (B)") if len(folders) > 1 or rows[0] == rows[1] else rows
+    alone = a.folder is b.folder  # one folder was named
+    names = (a.row, b.row) if alone and a.row != b.row else (f"{a.row} (A)", f"{b.row} (B)")
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     console.print(f"{names[0]} and {names[1]}, {len(common)} scenes of both ({units} independent)", style="bold")
-    for letter, folder, (said, _) in zip("AB", folders, (first, second), strict=False):
-        kept = said.meta.get("checkpoint")
+    for letter, side in zip("A" if alone else "AB", (a, b), strict=False):
+        kept = side.results.meta.get("checkpoint")
         trained = f", checkpoint {kept}" if kept not in (None, "None") else ""
-        console.print(f"{letter}: {folder}{trained}", markup=False, highlight=False, soft_wrap=True)
-    apart = differing(settings(results, one, rows[0]), settings(second[0], other, rows[1]))
-    if apart:
+        console.print(f"{letter}: {side.folder}{trained}", markup=False, highlight=False, soft_wrap=True)
+    if apart := differing(a.settings(), b.settings()):
         console.print(f"settings differ: {apart}", markup=False, highlight=False, soft_wrap=True)
+    rows = (a.row, b.row)
     found = {each: compared(one, other, rows, each, results.column(each).better, REFERENCES[0]) for each in metrics}
     console.print(table(results, names, found))
-    lone = len(set(one.scenes) ^ set(other.scenes))
-    notes = [f"{lone} scene{'s are' if lone > 1 else ' is'} in one of them alone and left out"] if lone else []
-    for note in [
-        *notes,
-        "an interval is of independent scenes, resampled for both alike; with under ten of them it is too narrow",
-    ]:
-        console.print(note, style="dim")
-
-
-def settings(results: Results, values: SceneValues, row: str) -> dict[str, Any]:
-    """What decides how a row came about: its task, its number of samples, and single options of sampler and task."""
-    said = values.facts.get("samples")
-    found = {key: values.facts.get(key) for key in SAME}
-    found["samples"] = said.get(row) if isinstance(said, dict) else said
-    return found | flat(results.meta.get("sampler", {})) | scalars(results.meta.get("task options", ""))
+    if lone := len(set(one.scenes) ^ set(other.scenes)):
+        console.print(f"{lone} scene{'s are' if lone > 1 else ' is'} in one of them alone and left out", style="dim")
+    narrow = "an interval is of independent scenes, resampled for both alike; with under ten of them it is too narrow"
+    console.print(narrow, style="dim")
 
 
 def scalars(text: str) -> dict[str, Any]:

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import difflib
 import itertools
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
-from magnet.cli.flags import flat, taken_out
+from magnet.cli.flags import taken_out
 from magnet.cli.named_files import READ, require_there, require_whole
 from magnet.cli.scene_files import CONTEXT, FUTURE
 from magnet.sampling.presets import PRESETS
-
-if TYPE_CHECKING:
-    from magnet.api import Model
-    from magnet.cli.tasks import TaskChoice
-    from magnet.motion.scene import Scene
-    from magnet.sampling.options import SamplerOptions
 
 HELP = "magnet predict --help files"
 
@@ -133,52 +124,9 @@ def main(arguments: Sequence[str]) -> int:
     size, one = tuple(options.size), options.samples == 1
     outs = [scene_files.path_to_write(out, options.inputs, size, one) for out in options.out]
     scene_files.refuse_unused_look(options, [out.suffix.lower() for out in outs])
-    from magnet.api import Model, Motion
-    from magnet.cli import predict_keys, predict_written
-    from magnet.cli.kept_checkpoints import checkpoint_of
-    from magnet.cli.predict_lengths import lengths
-    from magnet.denoiser.core import DenoiserCore
-    from magnet.generation.plan import plan_of_scene
-    from magnet.motion.tokens import TOKEN_FRAMES
+    from magnet.cli.predict_run import run
 
-    sampler = sampler_of(options.sampler or "default", groups["sampler"])
-    if options.spacing is not None:
-        sampler = dataclasses.replace(sampler, crowd_spacing=options.spacing)
-    recorded, body = read_files(options)  # before the model is loaded, so that what is not there is said at once
-    people = people_written(options, recorded)
-    for out in outs:
-        scene_files.require_unread(out, options.inputs, people)
-    if options.task not in (None, "generation"):  # of a crowd these are said later: it may change the task
-        task_of(options, groups["task"], ())
-    model = Model(DenoiserCore.load(checkpoint_of(options.ckpt_path)), sampler)
-    scene, added = people_of(options, recorded, model)
-    task = task_of(options, groups["task"], added)
-    files, (scene, context, frames) = scene, lengths(options, task, scene, added, model)
-    files, lead = predict_written.in_front(files, scene)
-    plan = plan_of_scene(model.denoiser, task.task, scene.agents, context, frames, sampler)
-    unmade = ~plan.finished
-    scene_files.say_other_body(model.denoiser, recorded.body)
-    for line in (
-        *predict_written.said_of_invalid(scene, plan.known, lead),
-        *predict_keys.said_of_keys(scene, plan.known, context // TOKEN_FRAMES),
-        *predict_written.said_of_unmade(task.name, files, lead, context + frames, unmade),
-    ):
-        print(line)
-    began = time.perf_counter()
-    moved = Motion.of(scene, body)
-    made = model.sample(moved, task.task, context, frames, seed=options.seed, samples=options.samples)
-    count, seen = made.scenes * (lead + made.frames), predict_written.said_of_given(made, lead)
-    print(f"{task.name}: {count} frames{seen} in {time.perf_counter() - began:.1f} s, seed {options.seed}")
-    from magnet.export import formats
-    from magnet.generation.unmade import completed
-
-    given, plain = lead + made.context, completed(made.plain(), files, plan.known, unmade, lead)
-    if plain.scenes > 1 and scene.scenes == 1:
-        plain = plain.replace(names=tuple(f"sample {number + 1}" for number in range(plain.scenes)))
-    look: dict[str, Any] = {"style": options.style, "size": size, "context_frames": given}
-    for out in outs:
-        scene_files.say_written(formats.write(plain, out, body, progress=True, **look))
-    return 0
+    return run(options, groups, outs)
 
 
 def require_counts(options: argparse.Namespace) -> None:
@@ -201,95 +149,3 @@ def files_of(folder: Path) -> str:
     """The first files of a folder that can be read, as they would be given; or what they would be."""
     files = sorted(str(path) for path in folder.iterdir() if path.suffix.lower() in READ)
     return " ".join(files[:2]) + (" ..." if len(files) > 2 else "") if files else "each person's .bvh, .glb or .npz"
-
-
-def read_files(options: argparse.Namespace) -> tuple[Scene, Any]:
-    """The people of all files, or a scene of nobody, and its body."""
-    import torch
-
-    from magnet.body import load_body
-    from magnet.motion.scene import FPS, empty_scene
-    from magnet.motion.tokens import TOKEN_FRAMES
-
-    if options.inputs:
-        reading = scene_files.reading(options, FPS)
-        got = scene_files.read_inputs(options, reading)
-        return got.scene, got.body
-    body = load_body(options.body or "open")
-    return empty_scene(1, TOKEN_FRAMES, 0, torch.zeros(())).replace(body=body.id), body
-
-
-def people_written(options: argparse.Namespace, scene: Scene) -> list[int]:
-    """How many people are there in each scene that will be written."""
-    people = scene.agents if options.people is None else options.people
-    if people < max(scene.agents, 1):
-        raise CommandError(f"--people {people}: expected at least {max(scene.agents, 1)}, as many as IN holds")
-    there: list[int] = scene.present.sum(dim=1).tolist()
-    return [count + people - scene.agents for count in there for _ in range(options.samples)]
-
-
-def people_of(options: argparse.Namespace, scene: Scene, model: Model) -> tuple[Scene, tuple[int, ...]]:
-    """The scene of all files with room for those who are made from nothing, and the slots of these.
-
-    A crowd is composed of the files' people, again and again, or of couples that the model makes.
-    """
-    import torch
-
-    from magnet.generation.crowd_start import crowd_from_nothing
-
-    people = scene.agents if options.people is None else options.people
-    if people > max(model.most_people, scene.agents):
-        if not options.inputs and not options.context and options.task in (None, "generation"):
-            return crowd_from_nothing(people, torch.Generator().manual_seed(options.seed)), ()
-        if options.context == 0:
-            raise CommandError(
-                f"--context 0: a crowd goes on from frames of everybody; it begins with {CONTEXT} by itself"
-            )
-        groups = [start_of_crowd(options, scene)] if options.inputs else []
-        options.context = options.context or (groups[0].frames if groups else CONTEXT)
-        return model.start_crowd(people, groups, model.sampler.crowd_spacing, seed=options.seed), ()
-    if options.spacing is not None:
-        raise CommandError(
-            f"--spacing {options.spacing:g}: places the groups of a crowd, which begins above {model.most_people} "
-            "people; leave it out"
-        )
-    added = tuple(range(scene.agents, people))
-    scene = scene.pad_agents(people)
-    present = scene.present.clone()
-    present[:, list(added)] = True
-    return scene.replace(present=present), added
-
-
-def start_of_crowd(options: argparse.Namespace, scene: Scene) -> Scene:
-    """The frames of the files that a crowd begins with: the first --context, or without it the last `CONTEXT`."""
-    if options.context is not None:
-        return scene.slice(0, options.context)
-    if scene.frames > CONTEXT:
-        print(f"the crowd begins with the last {CONTEXT} of {scene.frames} frames (--context T: with the first T)")
-    return scene.slice(max(scene.frames - CONTEXT, 0))
-
-
-def task_of(options: argparse.Namespace, flags: list[str], added: tuple[int, ...]) -> TaskChoice:
-    """The task; where people are added and it is for some of the people, it is for these."""
-    from magnet.cli.tasks import parse_task, task_class
-
-    name = options.task or ("joint_future" if options.inputs or options.context else "generation")
-    fields = {each.name for each in dataclasses.fields(task_class(name))}
-    below = [{"target": list(added)}] if added and "target" in fields else []
-    return parse_task(name, flags, below, "predict")
-
-
-def sampler_of(preset: str, flags: list[str]) -> SamplerOptions:
-    """How to sample."""
-    from jsonargparse import ArgumentParser
-
-    from magnet.cli.config_files import sampler_preset
-    from magnet.cli.tasks import read_fields
-    from magnet.sampling.guidance import Guidance
-    from magnet.sampling.options import SamplerOptions
-
-    known = ArgumentParser(exit_on_error=False)
-    known.add_class_arguments(SamplerOptions, "sampler")
-    known.set_defaults(flat({"sampler": sampler_preset(preset)}))
-    fields = read_fields(known, flags, (), "magnet predict --help sampler")["sampler"]
-    return SamplerOptions(**{**fields, "guidance": Guidance(**fields["guidance"])})

@@ -18,10 +18,8 @@ STILL = 1e-4
 def said_of_keys(recorded: Scene, known: Tensor, past: int) -> list[str]:
     """Warnings of keyframes that are too far from the one before, and of those in which somebody holds one pose.
 
-    Args:
-        recorded: B scenes of the files.
-        known: (N, P) bool, token steps that are read.
-        past: token steps that are given of everybody at the start.
+    recorded: B scenes of the files; known: (N, P) bool, token steps that are read; past: token steps that are given of
+    everybody at the start.
     """
     reached: dict[tuple[int, int], float] = {}
     held: set[tuple[int, int]] = set()

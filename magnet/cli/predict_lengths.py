@@ -61,10 +61,8 @@ def lengths(
 def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing: bool) -> int:
     """Frames that are given of everybody, in whole tokens, where the task reads what comes after them.
 
-    Args:
-        frames: of the files.
-        recorded: of these, in whole tokens.
-        nothing: what is not said is 0: somebody is made from nothing.
+    frames: of the files, `recorded` of them in whole tokens; nothing: what is not said is 0, for somebody is made from
+    nothing.
     """
     if options.inputs and not recorded:
         raise CommandError(f"the files hold {frames} frames at {FPS:g} a second; a token needs {TOKEN_FRAMES}")
