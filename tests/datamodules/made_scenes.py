@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magnet.datamodules import registry
 from magnet.datamodules.duobox import DuoBoxReader
-from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.fakes.body import Kind
 from magnet.datamodules.fakes.motion import UP, FakeMotion, people, rest_joints, turned
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.reading.recording import Axis, Reader, Recording
 from tests.datamodules.readers import fake_of, world_joints
+from tests.datamodules.remocap_fits import write_fitted_scenes
 
 MILLIMETRE = 0.001
 FITTED = 0.04
@@ -130,6 +130,6 @@ def written(form: str, root: Path, scenes: Mapping[str, FakeMotion], steps: Cano
     name, options, _ = FORMS[form]
     fake_of(name).write_scenes(root, scenes)
     if "fits" in options:
-        fake_remocap.write_fitted_scenes(root / "fits", scenes)
+        write_fitted_scenes(root / "fits", scenes)
         options = {"fits": root / "fits"}
     return PrepareJob(name, str(root), options, str(root / "body.npz"), steps)

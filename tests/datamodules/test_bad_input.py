@@ -16,10 +16,10 @@ import pytest
 from magnet import cli
 from magnet.cli.data_shown import SKIPPED_SHOWN
 from magnet.datamodules import registry
-from magnet.datamodules.fakes import remocap as fake_remocap
 from magnet.datamodules.reading.recording import Take
 from tests.cases import some_quick
 from tests.datamodules.readers import Foreign, cut, fake_of
+from tests.datamodules.remocap_fits import write_fitted_scenes
 from tests.export.glb_strangers import Written
 from tests.export.glb_strangers import opened as opened_glb
 
@@ -295,7 +295,7 @@ def test_bad_takes_are_listed_with_why_and_the_others_are_there(
     fake.write_scenes(root, scenes)
     options = {"phases": 1} if name == "duobox" else {}
     if form != name:
-        fake_remocap.write_fitted_scenes(root / "fits", scenes)
+        write_fitted_scenes(root / "fits", scenes)
         options = {"fits": root / "fits"}
     takes = {take.name: take for take in registry.reader(name)(root, **options).takes()}  # type: ignore[call-arg]
     scene = {take: take.rpartition("_")[0] if name == "duobox" else take for take in takes}  # of a file may be more

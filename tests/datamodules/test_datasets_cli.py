@@ -15,6 +15,7 @@ from magnet import cli
 from magnet.datamodules import registry
 from magnet.datamodules.fakes import remocap as fake_remocap
 from tests.cases import some_slow
+from tests.datamodules.remocap_fits import write_fitted_scenes
 
 CPU = ("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
 TINY = {
@@ -64,7 +65,7 @@ def test_ready_fits_and_bare_skeletons_train_as_well(name, options, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     magnet("data", "fake", name, "dl", "--frames", "30", "--takes", "1" if name == "duobox" else "4")
     if name == "remocap":
-        fake_remocap.write_fitted_scenes(tmp_path / "dl/fits", fake_remocap.scenes(4, 60, 0))
+        write_fitted_scenes(tmp_path / "dl/fits", fake_remocap.scenes(4, 60, 0))
     body, options = ("--body", "dl/body.npz"), ("--min_frames", "8", *options)
     magnet("data", "check", "dl", "--name", name, "--workers", "1", "--picture", "none", *options, *body)
     assert "all assertions hold" in capsys.readouterr().out

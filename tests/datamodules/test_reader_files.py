@@ -16,12 +16,13 @@ import pytest
 
 from magnet import cli
 from magnet.datamodules import registry
-from magnet.datamodules.fakes.remocap import scenes, write_fitted_scenes
+from magnet.datamodules.fakes.remocap import scenes
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob, content, take_key
 from tests.cases import few, some_quick
 from tests.datamodules.made_scenes import FORMS, written
 from tests.datamodules.readers import fake_of
+from tests.datamodules.remocap_fits import write_fitted_scenes
 
 SEEN: set[Path] | None = None
 """Files opened by this process, while they are of interest."""

@@ -16,6 +16,7 @@ from magnet.datamodules.reading.recording import DataError, Recording
 from magnet.datamodules.reading.remocap_track import read_bvh_header
 from magnet.datamodules.remocap import ReMoCapReader
 from magnet.unpickle import load_pickle
+from tests.datamodules.remocap_fits import write_fitted_scenes
 
 TAKES, FRAMES = 4, 6
 PERSON = "ReMoCap/LindyHop/train/3/0"
@@ -25,7 +26,7 @@ TOTAL = fake.length(FRAMES)
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("fits")
-    fake.write_fitted_scenes(root, fake.scenes(4, FRAMES, 0))
+    write_fitted_scenes(root, fake.scenes(4, FRAMES, 0))
     return root
 
 

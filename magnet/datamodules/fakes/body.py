@@ -37,13 +37,7 @@ def write_body(path: str | Path, kind: Kind = "smplx") -> Path:
 
 @lru_cache(maxsize=2)
 def arrays(kind: Kind = "smplx") -> dict[str, NDArray]:
-    """The body file's arrays by key.
-
-    Raises:
-        ValueError: no such kind.
-    """
-    if kind not in ("smplx", "smpl"):
-        raise ValueError(f"kind: got {kind!r}, expected 'smplx' or 'smpl'")
+    """The body file's arrays by key."""
     J, dirs, parents = _joints(kind)
     K = len(J)
     size = np.where(np.arange(K) < 22, 0.05, 0.012)
