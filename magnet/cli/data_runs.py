@@ -11,18 +11,8 @@ from typing import Any
 from rich.console import Console
 
 from magnet.body import Body, load_body
+from magnet.cli import data_shown
 from magnet.cli.data_options import job_of
-from magnet.cli.data_shown import (
-    file_bars,
-    show_gaps,
-    show_notes,
-    show_persons,
-    show_problems,
-    show_skipped,
-    show_splits,
-    training_commands,
-    why_untrained,
-)
 from magnet.datamodules import registry
 from magnet.datamodules.clip import MOST, at_least, at_most
 from magnet.datamodules.preparing import check
@@ -61,15 +51,15 @@ def run_info(given: argparse.Namespace) -> int:
     out.print(f"{rows:,} frames of one person, {size / 2**20:.1f} MiB; splits by {m['splits by']}")
     if m.get("limit"):
         out.print(f"a try-out: at most {counted(m['limit'], 'take')} of each split")
-    show_splits(m["splits"])
-    show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
-    show_notes([check.noted(entry["note"], entry["takes"]) for entry in m["notes"]])
-    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    data_shown.show_splits(m["splits"])
+    data_shown.show_persons([(entry["persons"], len(entry["takes"])) for entry in m.get("persons", [])])
+    data_shown.show_notes([check.noted(entry["note"], entry["takes"]) for entry in m["notes"]])
+    data_shown.show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
     if m.get("listed but not there"):
         out.print(absent_note(m["listed but not there"]), soft_wrap=True, markup=False)
     if m["left out"]:
         out.print(f"in no split: {counted(len(m['left out']), 'take')}")
-    show_gaps(m["splits"], "limit" in m)
+    data_shown.show_gaps(m["splits"], "limit" in m)
     return 0
 
 
@@ -84,13 +74,13 @@ def run_check(given: argparse.Namespace) -> int:
         name = given.name or check.recognise(path)
         picture = picture_of(given, name)
         found, body = checked_download(given, name, path)
-    show_splits(found.splits, title=found.title)
-    show_notes(found.notes)
-    show_skipped(found.skipped)
-    show_gaps(found.splits, found.limited)
+    data_shown.show_splits(found.splits, title=found.title)
+    data_shown.show_notes(found.notes)
+    data_shown.show_skipped(found.skipped)
+    data_shown.show_gaps(found.splits, found.limited)
     if picture is not None and check.draw(found, picture, body):
         print(f"picture: {picture}")
-    show_problems(found.problems)
+    data_shown.show_problems(found.problems)
     count = len(found.problems)
     print(f"{count} problem{'s' * (count > 1)}" if count else "all assertions hold")
     return FAILED if found.problems else 0
@@ -150,16 +140,16 @@ def run_prepare(given: argparse.Namespace) -> int:
     if m["listed but not there"]:
         print(absent_note(m["listed but not there"]))
     print(f"{counted(report.made - report.failed, 'take')} converted, {report.kept} kept from an earlier run")
-    show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
-    show_gaps(m["splits"], "limit" in m)
+    data_shown.show_skipped([(entry["take"], entry["why"]) for entry in m["skipped"]])
+    data_shown.show_gaps(m["splits"], "limit" in m)
     takes = sum(split["takes"] for split in m["splits"].values())
     said = f"{f'{takes} takes are' if takes != 1 else '1 take is'} in {out}; {len(m['skipped'])} were skipped."
-    if why := why_untrained(m):
+    if why := data_shown.why_untrained(m):
         print(f"{said} Nothing can be trained on it, for split train is empty: {why}")
         return 0
     print(f"{said} To train on it:")
     longest = int(report.folder.split("test").frames.max(initial=0))
-    for line in training_commands(name, out, given.body, longest):
+    for line in data_shown.training_commands(name, out, given.body, longest):
         print(f"  {line}")
     return 0
 
@@ -187,11 +177,11 @@ def run_download(given: argparse.Namespace) -> int:
         kind = registry.reader(name)
         raise ValueError(f"{kind.title} is given out by its authors alone: ask at {kind.source} ({kind.licence})")
     (out,) = needed(given, "out")
-
     subjects = [word.strip() for word in given.subjects.split(",") if word.strip()]
     options: dict[str, Any] = {"any_version": True} if given.any_version else {}
     options |= {} if given.base_url is None else {"base_url": given.base_url}
-    with file_bars() as tell, writing(out, "choose another --out; then run the same command again, which goes on"):
+    again = "choose another --out; then run the same command again, which goes on"
+    with data_shown.file_bars() as tell, writing(out, again):
         got = download.download_cmu(subjects, out, progress=tell, **options)
     print(f"{counted(len(got.fetched), 'file')} fetched, {len(got.kept)} there before, in {got.folder}")
     if got.unlike:

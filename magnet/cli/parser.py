@@ -105,7 +105,9 @@ class Parser(LightningArgumentParser):
         self.usage = USAGE.format(command=self.command, more="[--task NAME] " if "task" in self.classes else "")
         for key in self.classes:
             self._name_choices(key)
-        self._explain_checkpoint()
+        group, _ = option(self, "ckpt_path")
+        group.title, group.description = "the weights", None
+        self.explain("ckpt_path", "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"]))
         for action in self._actions:
             if action.option_strings and action.option_strings[0].endswith(".help"):
                 action.help = argparse.SUPPRESS  # of classes that Lightning brings
@@ -157,11 +159,6 @@ class Parser(LightningArgumentParser):
         default = f"; default: {path.rpartition('.')[2]}" if path else ""
         group.title, action.help = f"--{key} NAME", argparse.SUPPRESS
         group.description = f"One of {', '.join(self.classes[key])}{default}. Fields are --{key}.FIELD VALUE."
-
-    def _explain_checkpoint(self) -> None:
-        group, _ = option(self, "ckpt_path")
-        group.title, group.description = "the weights", None
-        self.explain("ckpt_path", "FILE", CKPT_PATH.get(self.command, CKPT_PATH["validate"]))
 
     def explain(self, key: str, value: str, text: str) -> None:
         """Set the help of an option that Lightning or the parser has made."""

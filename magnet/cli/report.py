@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from magnet.cli.flags import PlainParser
 
@@ -66,6 +66,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     blocks = {name: TABLES[name](plan) for name in names}
     cells = cells_of(block for each in blocks.values() for block in each)
     store = Store(given.out)
+    git = provenance()["git"]
     own_data = Path(given.data) if given.data.endswith((".yaml", ".yml")) else None
     runner = Runner(
         store,
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] = ()) -> int:
         given.configs,
         given.ckpt_path,
         plan.budget.speed_rounds,
-        short_commit(provenance()["git"]),
+        "" if git is None else git["commit"][:7] + "+" * git["changed"],  # a plus where files were changed
         own_data,
     )
     wanted = chosen(runner, cells, given.only or [""], given.skip)
@@ -93,11 +94,6 @@ def main(arguments: Sequence[str] = ()) -> int:
     store.pack()
     print(f"written: {written}, report.json and cells.json")
     return int(bool(runner.failed))
-
-
-def short_commit(git: Mapping[str, Any] | None) -> str:
-    """A state of the source tree: its short commit, and a plus where files were changed; empty where none is known."""
-    return "" if git is None else git["commit"][:7] + "+" * git["changed"]
 
 
 def chosen(runner: Runner, cells: Sequence[Cell], only: Sequence[str], skip: Sequence[str]) -> list[Cell]:

@@ -35,7 +35,7 @@ def kept_frames(path: str | Path, frames: int, start: int, end: int | None) -> s
 def require_one_clock(paths: Sequence[str | Path], rates: Sequence[float], start: int, end: int | None) -> None:
     """Refuse to cut files of different rates by one number of frames, which would be another moment in each."""
     if (start or end is not None) and len(set(rates)) > 1:
-        each = ", ".join(f"{path} {rate:g} fps" for path, rate in zip(paths, rates, strict=True))
+        each = _each(paths, [f"{rate:g} fps" for rate in rates])
         raise ValueError(f"frame rates differ: {each}; --start and --end count frames, so cut each with magnet export")
 
 
@@ -121,12 +121,7 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
     """
     if fps is not None:
         people = [resampled(person, fps) for person in people]
-    rates = {person.fps for person in people}
-    if len(rates) > 1:
-        raise ValueError(
-            f"frame rates differ: {_each(labels, [f'{person.fps:g} fps' for person in people])}; "
-            f"bring all to one with magnet export --fps 30, or fps=30 in Python"
-        )
+    require_one_rate(labels, [person.fps for person in people])
     bodies = {person.body for person in people}
     if len(bodies) > 1:
         raise ValueError(f"bodies differ: {_each(labels, [person.body for person in people])}")
@@ -150,5 +145,14 @@ def together(people: Sequence[Scene], labels: Sequence[str], *, fps: float | Non
     return cat_agents(people).replace(valid=valid, given=None if given is None else torch.cat(given, dim=2))
 
 
-def _each(labels: Sequence[str], what: Sequence[str]) -> str:
+def require_one_rate(labels: Sequence[object], rates: Sequence[float]) -> None:
+    """Refuse files of different frame rates, where nobody says one for all."""
+    if len(set(rates)) > 1:
+        each = _each(labels, [f"{rate:g} fps" for rate in rates])
+        raise ValueError(
+            f"frame rates differ: {each}; bring all to one with magnet export --fps 30, or fps=30 in Python"
+        )
+
+
+def _each(labels: Sequence[object], what: Sequence[str]) -> str:
     return ", ".join(f"{label} {value}" for label, value in zip(labels, what, strict=True))

@@ -12,15 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.export import table_times
 from magnet.export.naming import recognised
 from magnet.export.rig_motion import LONGEST, MOST_AWAY, Floats, usual_rate
-from magnet.export.table_times import (
-    TableRows,
-    frames_by_time,
-    require_one_recording,
-    require_times_with_frames,
-    require_told_apart,
-)
+from magnet.export.table_times import TableRows
 from magnet.files import regular, said_sign
 
 COLUMN = re.compile(r"(?i)^(.+?)[ _.:-]*([xyz])(?:[ _.(\[]*(mm|cm|m)[)\]]?)?$")
@@ -96,7 +91,7 @@ def read_table(path: str | Path) -> JointTable:
     frame_at = time_at if seconds is None and frame_at is None else frame_at
     where = np.array(list(columns.values()))
     if frame_at is None and seconds is not None and len(people) == 1:
-        require_told_apart(path, seconds, numbers[:, where.ravel()])
+        table_times.require_told_apart(path, seconds, numbers[:, where.ravel()])
     frame, step = _frames(table, numbers, frame_at, seconds)
     at = np.full((int(frame.max()) + 1, len(people), len(columns), 3), np.nan)
     seen: set[tuple[int, str]] = set()
@@ -216,7 +211,7 @@ def _frames(
     path = table.path
     if column is None:
         if seconds is not None and np.isfinite(seconds).all():
-            frame = frames_by_time(table, seconds)
+            frame = table_times.frames_by_time(table, seconds)
             if frame.max() >= LONGEST:
                 long = f"{np.ptp(seconds):.6g} seconds"
                 raise ValueError(f"{path}: times of {long}, more frames than are read ({LONGEST})")
@@ -237,9 +232,9 @@ def _frames(
     if (wrong := said[~(np.isfinite(said) & (said == np.round(said)))]).size:
         raise ValueError(f"{path}: frame {wrong[0]:g}: expected whole numbers")
     if len(set(zip(table.told, said.tolist(), strict=True))) < len(said):
-        require_one_recording(table, said, "frames")
+        table_times.require_one_recording(table, said, "frames")
     if seconds is not None:
-        require_times_with_frames(table, seconds, said)
+        table_times.require_times_with_frames(table, seconds, said)
     frame = np.minimum(said - said.min(), 2.0**53).astype(np.int64)
     step = max(int(np.gcd.reduce(frame)), 1) if len(set(frame.tolist())) > 2 else 1
     if frame.max() // step >= LONGEST:

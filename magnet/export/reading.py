@@ -75,19 +75,27 @@ def read(
         regular(file)
     body = body if isinstance(body, Body) else load_body("open" if body is None else body)
     if suffixes <= set(RIGS):
-        if options.in_fps is not None:
-            said = f"a {min(suffixes)} says its own, --fps resamples"
-            raise ValueError(f"in_fps: is for {', '.join((*ARRAYS, TABLE))} files that say no frame rate; {said}")
-        imported = load_rigs(files, body, **vars(options))
-        notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
-        if abs(imported.floor) >= UNSEEN:
-            way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
-            notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
-        return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body), *in_place(imported.scene)))
+        return _from_rigs(files, body, options)
     if options.clip is not None:
         raise ValueError(f"{files[0]}: clip: chooses an animation of a .glb")
-    if suffixes == {TABLE}:
-        return _from_tables(files, body, options)
+    return _from_tables(files, body, options) if suffixes == {TABLE} else _from_arrays(files, body, options)
+
+
+def _from_rigs(files: Sequence[Path], body: Body, options: Reading) -> Read:
+    """People by the skeletons of other programs."""
+    if options.in_fps is not None:
+        said = f"a {min(file.suffix.lower() for file in files)} says its own, --fps resamples"
+        raise ValueError(f"in_fps: is for {', '.join((*ARRAYS, TABLE))} files that say no frame rate; {said}")
+    imported = load_rigs(files, body, **vars(options))
+    notes = [*(str(source) for source in imported.sources), *rates_note(imported.rates, imported.scene.fps)]
+    if abs(imported.floor) >= UNSEEN:
+        way = f"{'lowered' if imported.floor > 0 else 'raised'} by {100 * abs(imported.floor):.1f} cm"
+        notes.append(f"everybody was {way} onto the floor; --keep_floor leaves them")
+    return Read(imported.scene, body, (*notes, *_floor_note(imported.scene, body), *in_place(imported.scene)))
+
+
+def _from_arrays(files: Sequence[Path], body: Body, options: Reading) -> Read:
+    """Scenes of ours, and people by the keys of SMPL's family."""
     if options.joints:
         kinds = ", ".join((*RIGS, TABLE))
         raise ValueError(f"{files[0]}: joint: is for {kinds}; in arrays joints are where SMPL-X has them")

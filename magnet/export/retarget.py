@@ -24,11 +24,10 @@ from magnet.body.fit import fit_body, floor_height, jumps_in, swing
 from magnet.errors import first_names
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
-from magnet.export.cutting import require_one_clock, together
+from magnet.export.cutting import require_one_clock, require_one_rate, together
 from magnet.export.read_options import Reading
 from magnet.export.rig import LIMBS, Skeleton, people_of, require_unit, require_up, understood_together
 from magnet.export.rig_files import read_rigs
-from magnet.export.rig_motion import RigMotion
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
 
@@ -134,12 +133,8 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any)
     start, end = options.start, options.end
     files = [rig for path in each for rig in people_of(read_rigs(path, start, end, options.clip), options.joints)]
     require_one_clock([file.path for file in files], [file.fps for file in files], start, end)
-    rates = {file.fps for file in files}
-    if len(rates) > 1 and options.fps is None:
-        found = ", ".join(f"{file.path} {file.fps:g} fps" for file in files)
-        raise ValueError(
-            f"frame rates differ: {found}; bring all to one with magnet export --fps 30, or fps=30 in Python"
-        )
+    if options.fps is None:
+        require_one_rate([file.path for file in files], [file.fps for file in files])
     prescribed = {file.up for file in files}  # where all are of formats that say it
     up = options.up or (prescribed.pop() if len(prescribed) == 1 else None)
     for file in files:
@@ -148,7 +143,8 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any)
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
     sources = tuple(replace(source, jumps=found) for (_, source), found in zip(read, jumps, strict=True))
-    people = [_tracked(one, file) for (one, _), file in zip(read, files, strict=True)]
+    tracked = [None if file.tracked is None else torch.from_numpy(file.tracked)[None] for file in files]
+    people = [one.replace(valid=valid) for (one, _), valid in zip(read, tracked, strict=True)]
     names = [f"{file.path} {file.person}".rstrip() for file in files]
     scene = together(people, names, fps=options.fps, trim=options.trim)
     floor = 0.0
@@ -161,22 +157,12 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any)
     return Imported(named, sources, floor, tuple(file.fps for file in files))
 
 
-def _tracked(scene: Scene, file: RigMotion) -> Scene:
-    """One person's scene, in which frames that the file lacks are not valid."""
-    return scene.replace(valid=None if file.tracked is None else torch.from_numpy(file.tracked)[None])
-
-
 def onto(
     skeleton: Skeleton, body: Body, refuse_above: float = REFUSED_FIT, most_shape: float | None = None
 ) -> tuple[Scene, Source]:
-    """One person on a body, and how the file was read.
+    """One person on a body, and how the file was read; a ValueError where it does not fit.
 
-    Args:
-        refuse_above: mean distance of limb joints, in metres, above which a fit is refused.
-        most_shape: largest fitted shape number; None: no bound.
-
-    Raises:
-        ValueError: no fit.
+    refuse_above: mean distance of limb joints, in metres; most_shape: largest fitted shape number, None: no bound.
     """
     return _exact(skeleton, body) or _fitted(skeleton, body, refuse_above, most_shape)
 

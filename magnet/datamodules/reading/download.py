@@ -129,7 +129,8 @@ def download_cmu(
             (kept if there else fetched).append(name)
             if manifest.get(name) != found:
                 manifest[name] = found
-                _write_manifest(folder, manifest)
+                lines = (f"{digest}  {each}\n" for each, digest in sorted(manifest.items()))
+                write_whole(folder, MANIFEST, "".join(lines).encode())
     if refused:
         raise DownloadError(_refusal(refused))
     return Downloaded(folder, tuple(fetched), tuple(kept), tuple(unlike))
@@ -333,10 +334,6 @@ def _whole(path: Path, known: str | None) -> bool:
 
 def _hashes(text: str) -> dict[str, str]:
     return {name: found for found, name in re.findall(r"^([0-9a-f]{64})  (.+)$", text, flags=re.MULTILINE)}
-
-
-def _write_manifest(folder: Path, manifest: dict[str, str]) -> None:
-    write_whole(folder, MANIFEST, "".join(f"{found}  {name}\n" for name, found in sorted(manifest.items())).encode())
 
 
 def known_hashes() -> dict[str, str]:

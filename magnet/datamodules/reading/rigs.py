@@ -73,7 +73,9 @@ class RigTrack:
         """The person on `body`; fitted, unless the skeleton is the body's own."""
         (skeleton,) = _skeletons([self.resampled(fps)], self.up or up.lstrip("+"))
         scene, _ = onto(skeleton, body, self.worst, LIKELY_SHAPE)
-        joints, theirs = _limbs(skeleton)
+        ours = skeleton.naming.joints
+        joints = [joint for joint in LIMBS if joint in ours]
+        theirs = [ours[joint] for joint in joints]
         off = body.joints(scene)[0, :, 0, joints] - torch.from_numpy(skeleton.at[:, theirs]).float()
         return scene, off.norm(dim=-1).mean(dim=-1)
 
@@ -86,13 +88,6 @@ def _skeletons(tracks: Sequence[RigTrack], up: str | None = None) -> list[Skelet
         return understood_together([track.file for track in tracks], tracks[0].unit, up, tracks[0].joints)
     except ValueError as error:
         raise DataError(str(error)) from error
-
-
-def _limbs(skeleton: Skeleton) -> tuple[list[int], list[int]]:
-    """Our limb joints that a skeleton has, and their numbers there."""
-    ours = skeleton.naming.joints
-    there = [joint for joint in LIMBS if joint in ours]
-    return there, [ours[joint] for joint in there]
 
 
 class RigReader(OwnReader[RigTrack]):

@@ -56,10 +56,7 @@ def simplified(points: Floats, faces: Ints, weights: Floats, vertices: int) -> L
     A collapse takes a vertex into a neighbour. Its cost is the sum of squared distances of the neighbour from the
     planes of all triangles that have gone into either (Garland and Heckbert 1997, with the neighbour as the place),
     and what the skinning weights differ. Many collapses that do not touch each other make one round. Vertices at holes
-    stay.
-
-    Args:
-        points: (V, 3) metres; faces: (F, 3); weights: (V, 22).
+    stay. points: (V, 3) metres; faces: (F, 3); weights: (V, 22).
     """
     planes, area = _planes(points, faces)
     quadric = np.zeros((len(points), 4, 4))  # squared distance from the planes of a vertex's triangles
@@ -72,7 +69,8 @@ def simplified(points: Floats, faces: Ints, weights: Floats, vertices: int) -> L
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     while (left := len(np.unique(faces))) > vertices:
         linked = _linked(faces, len(points))
-        source, goal = _both_ways(linked, len(points))
+        low, high = linked // len(points), linked % len(points)
+        source, goal = np.concatenate([low, high]), np.concatenate([high, low])  # each edge in both directions
         cost = np.einsum("ei,eij,ej->e", homogeneous[goal], quadric[source] + quadric[goal], homogeneous[goal])
         apart = np.abs(weights[source] - weights[goal]).sum(axis=1) / 2
         cost = np.maximum(cost, 0.0) + reach[source] * (BENDS * apart) ** 2
@@ -114,12 +112,6 @@ def _linked(faces: Ints, vertices: int) -> Ints:
     """Every edge once, as smaller end * V + greater end, rising."""
     ends = np.sort(_edges(faces), axis=1)
     return np.unique(ends[:, 0] * vertices + ends[:, 1])
-
-
-def _both_ways(linked: Ints, vertices: int) -> tuple[Ints, Ints]:
-    """Where every edge begins and ends, once in each direction."""
-    low, high = linked // vertices, linked % vertices
-    return np.concatenate([low, high]), np.concatenate([high, low])
 
 
 def _border(faces: Ints, vertices: int) -> Ints:
