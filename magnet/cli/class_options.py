@@ -39,9 +39,7 @@ class Settled:
 def settle(layers: Sequence[Layer], flags: Sequence[str]) -> Settled:
     """Find the classes that win, and remove the options of other classes from each layer.
 
-    Args:
-        layers: lowest first; those without a path are not the user's own.
-        flags: the command line after the command, which beats all layers.
+    layers: lowest first; those without a path are not the user's own. flags: the command line, which beats all layers.
     """
     layers = [replace(layer, options=copy.deepcopy(layer.options)) for layer in layers]
     classes, notes = {}, []
@@ -75,10 +73,7 @@ def one_class(flags: Sequence[str]) -> list[str]:
 def spelt_out(value: Any, paths: Mapping[str, str], named: bool = True) -> Any:
     """What stands under `data`, with short names that several classes have as dotted paths.
 
-    Args:
-        value: a name, or a class with its options, or a list of these.
-        paths: dotted paths by short name.
-        named: whether a text that stands here is a class's name.
+    value: a name, or a class with its options, or a list of these; named: whether a text here is a class's name.
     """
     if isinstance(value, dict):
         return {key: spelt_out(part, paths, key in ("class_path", "data")) for key, part in value.items()}

@@ -197,12 +197,9 @@ def help_topic(arguments: Sequence[str]) -> str | None:
 def chosen_flags(
     actions: Sequence[str], classes: Mapping[str, Mapping[str, Sequence[str]]], chosen: Mapping[str, str]
 ) -> list[str]:
-    """All options that may be meant: the command's, and those of the classes that are chosen, or may be.
+    """All options that may be meant: the command's `actions`, and those of the classes that are chosen, or may be.
 
-    Args:
-        actions: the command's own.
-        classes: options of each class, without dashes, by key and short name.
-        chosen: the class under a key, short or dotted, where one is.
+    classes: options of each class, without dashes, by key and short name; chosen: the class under a key, where one is.
     """
     flags = list(actions)
     for key, kinds in classes.items():

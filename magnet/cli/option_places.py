@@ -21,13 +21,8 @@ from magnet.cli.flags import valued
 def place_of(layers: Sequence[str], field: str, got: str | None = None) -> tuple[str, str] | None:
     """The place of an option, such as data.data[1].init_args.speeds, and the class that it was given to.
 
-    Args:
-        layers: YAML or files of it.
-        field: the option, perhaps with groups before it.
-        got: the value that does not fit it; None: the class has no such option.
-
-    Returns:
-        None where no class in a list was given it so, or several were.
+    None where no class in a list was given it so, or several were. layers: YAML or files of it; got: the value that
+    does not fit it, None: the class has no such option.
     """
 
     def wrong(spec: dict[str, Any]) -> bool:
@@ -77,14 +72,13 @@ def in_files(
 ) -> tuple[str, str] | None:
     """The file and line in which an option stands, and its whole key there, in the last of the files that has it.
 
+    None where no file has it, or where one has several of the name.
+
     Args:
         files: of YAML, later ones win.
         field: the option, with as many of the groups before it as are known.
         got: the value that does not fit it; None: there is no such option.
         known: options that there are, as `data.batch_size`, which are not meant.
-
-    Returns:
-        None where no file has it, or where one has several of the name.
     """
     end = f".{flat_key(field)}"
     for file in reversed(files):

@@ -89,11 +89,7 @@ def cast(scene: Scene, body: Body, style: Style, known: Tensor | None = None) ->
 
 
 def default_body(scene: Scene) -> Body:
-    """The packaged open body, for scenes that belong to it.
-
-    Raises:
-        ValueError: the scene belongs to another body, which must be given.
-    """
+    """The packaged open body, for scenes that belong to it; a body of one's own must be given."""
     body = load_body("open")
     if scene.body != body.id:
         raise ValueError(
@@ -103,11 +99,7 @@ def default_body(scene: Scene) -> Body:
 
 
 def panels(scenes: Scenes) -> list[tuple[str, Scene]]:
-    """Labelled scenes with B = 1 each.
-
-    Raises:
-        ValueError: no scene, or scenes of different lengths or frame rates.
-    """
+    """Labelled scenes with B = 1 each; refused where there are none, or of different lengths or frame rates."""
     if isinstance(scenes, Scene):
         names = scenes.names or ("",) * scenes.scenes
         labels = [f"{name} · {b + 1}" if name and names.count(name) > 1 else name for b, name in enumerate(names)]
@@ -137,11 +129,7 @@ def casts(scenes: Scenes, context_frames: int, body: Body | None, style: Style) 
 
 
 def known_frames(scene: Scene, context_frames: int) -> Tensor:
-    """(T, P) bool: which frames a model was given, as a scene (B = 1) says, else the first ones of everybody.
-
-    Raises:
-        ValueError: more context than frames.
-    """
+    """(T, P) bool: which frames a model was given, as a scene (B = 1) says, else the first ones of everybody."""
     if not 0 <= context_frames <= scene.frames:
         raise ValueError(f"context_frames: got {context_frames}, expected 0 to {scene.frames}, the scene's frames")
     if scene.given is not None:

@@ -1,4 +1,7 @@
-"""FBX to and from GLB by Blender, because no maintained free library reads and writes its skins and motion."""
+"""FBX to and from GLB by Blender, because no maintained free library reads and writes its skins and motion.
+
+Everything here raises ImportError where Blender is not, and ValueError with Blender's own words where it fails.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +28,7 @@ NEEDS = (
 
 
 def blender() -> list[str]:
-    """The command that runs a script in Blender: `MAGNET_BLENDER`, this Python where it has bpy, or the program.
-
-    Raises:
-        ImportError: none of them is there.
-    """
+    """The command that runs a script in Blender: `MAGNET_BLENDER`, this Python where it has bpy, or the program."""
     if python := os.environ.get(VARIABLE):
         return [python]
     if importlib.util.find_spec("bpy") is not None:
@@ -42,12 +41,10 @@ def blender() -> list[str]:
 def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:
     """Write one scene (B = 1) as FBX, everybody skinned and animated, with a keyframe for every frame.
 
-    Returns:
-        The path written.
+    Returns the path written.
 
     Raises:
-        ImportError: Blender is not here; says how to get it.
-        ValueError: what `save_glb` refuses, or Blender's own words where it fails.
+        ValueError: what `save_glb` refuses.
     """
     blender()
     path = suffixed(path, ".fbx")
@@ -57,12 +54,7 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
 
 
 def as_fbx(glb: Path, path: Path, fps: float) -> None:
-    """Write a GLB as FBX, with a keyframe for every frame.
-
-    Raises:
-        ImportError: Blender is not here; says how to get it.
-        ValueError: Blender's own words where it fails.
-    """
+    """Write a GLB as FBX, with a keyframe for every frame."""
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "scene.fbx"
         run_script(AS_FBX, glb, made, f"write {path}", f"{fps:g}")
@@ -71,12 +63,7 @@ def as_fbx(glb: Path, path: Path, fps: float) -> None:
 
 
 def converted(fbx: Path, glb: Path) -> Path:
-    """A GLB of an FBX's skeletons and their motion, a keyframe for every frame. Returns its path.
-
-    Raises:
-        ImportError: Blender is not here; says how to get it.
-        ValueError: Blender's own words where it fails.
-    """
+    """A GLB of an FBX's skeletons and their motion, a keyframe for every frame. Returns its path."""
     run_script(AS_GLB, fbx, glb, f"read {fbx}")
     return glb
 

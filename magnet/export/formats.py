@@ -144,7 +144,7 @@ def write(
     """Write a scene in the format of the path's suffix.
 
     Of several scenes (B > 1), npz and csv hold all, pictures and pages show them side by side, and every other format
-    gets a file each: out_scene0.glb ...
+    gets a file each: out_scene0.glb ... Returns the paths written.
 
     Args:
         body: the scene's body model; None: the open one.
@@ -159,9 +159,6 @@ def write(
         size: pixels of a film's panel, width and height, even numbers.
         each: with smplx, a file per person: out_person0.npz, out_person1.npz ...
         rigs, rig_joints: characters of your own that are moved: see `magnet.export.onto_rig.save_onto`.
-
-    Returns:
-        The paths written.
 
     Raises:
         ValueError: a suffix that nothing writes, or a scene that the format cannot hold.

@@ -36,12 +36,10 @@ def save_glb(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     Each person present is a node `person_0`, `person_1` ..., numbered by slot, with a bone on the floor, the 22 joints
     below it, and a mesh skinned to them in the slot's colour. At rest everybody stands on the floor in the T pose.
     People of one shape share a mesh. Pose correctives of a SMPL-X file cannot be expressed and are left out.
+    Returns the path written.
 
     Args:
         bones: names and hierarchy of bones, and the number of animations.
-
-    Returns:
-        The path written.
 
     Raises:
         ValueError: more than one scene, nobody present, no frames, or another body's.

@@ -53,12 +53,10 @@ def save_smplx(scene: Scene, path: str | Path, body: Body, *, apart: bool = Fals
     says which body model the scene is of, and `given` (P, T), where the scene has it, what a model was given.
     The open body's shapes mean nothing to SMPL-X: its betas are written as zero, J0 is that of SMPL-X's mean shape, so
     that pelvises are right in SMPL-X's tools, and `body_betas` (P, 10) keeps the shapes for `read_smplx`.
+    Returns the paths written.
 
     Args:
         apart: one file per person (path_person0.npz ... by slot) without the axis P, as most tools expect.
-
-    Returns:
-        The paths written.
 
     Raises:
         ValueError: more than one scene, nobody present, or another body's.

@@ -68,14 +68,11 @@ def save_onto(
     """Write one scene (B = 1) as characters of your own: a file a person, out_person0.glb ..., or the path for one.
 
     Hips are where people's are, higher or lower as legs are longer or shorter; bones turn as people's, those that we
-    have not (fingers, twists, faces) stay as they rest on the one above.
+    have not (fingers, twists, faces) stay as they rest on the one above. Returns the paths written.
 
     Args:
         rigs: files of one character each, of a kind that `RIGS_FOR` has for the path's suffix: one for everybody, or
             one for each person present.
-
-    Returns:
-        The paths written.
 
     Raises:
         FileNotFoundError: there is no such character.

@@ -31,6 +31,8 @@ def contact_sheet(
 ) -> Path:
     """Write a PNG whose rows are scenes (samples, methods, the truth) and whose columns are moments.
 
+    Returns the path written.
+
     Args:
         scenes: a scene, each of its B a row, or labelled scenes; all of one length and frame rate.
         columns: how many moments, evenly spread from the first frame to the last.
@@ -39,9 +41,6 @@ def contact_sheet(
         frames: the frames to show, in place of `columns`.
         body: the scenes' body model; the packaged one if None.
         cell: pixels of one picture in the sheet.
-
-    Returns:
-        The path written.
 
     Raises:
         ValueError: scenes that cannot be drawn, or a frame outside them.

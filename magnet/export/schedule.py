@@ -151,13 +151,11 @@ def draw_schedule(
 
     The more saturated a box, the cleaner its token. Pink was given. Dashed boxes are not available to the
     agents that are being updated; a filled box with dashes is hidden from the agents in whose colours they are.
+    Returns the path written.
 
     Args:
         count: how many moments of the denoising at most.
         unit: pixels of the thinnest line.
-
-    Returns:
-        The path written.
 
     Raises:
         ValueError: not a .png, or too few moments.

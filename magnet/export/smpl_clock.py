@@ -101,14 +101,8 @@ def shared_clock(
 ) -> SharedClock | None:
     """The clock of people from the frame that the last of them begins with to the one that the first of them ends with.
 
-    Args:
-        where: the file or files, for messages.
-        numbers: of each person's frames.
-        names: of the people, for messages.
-        lost: what happens to frames in which somebody was not seen, for the note on them.
-
-    Returns:
-        None where nobody's frames are numbered.
+    None where nobody's frames are numbered. names: of the people, for messages; lost: what happens to frames in which
+    somebody was not seen, for the note on them.
 
     Raises:
         DataError: only some have numbers, or there is no frame in which all were seen.

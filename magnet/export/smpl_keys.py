@@ -51,9 +51,7 @@ OTHERS = {
 }
 """By how many numbers a joint has: what they are, how that is told, and what to do. Nine come first: of a matrix's
 nine numbers six may look like two columns."""
-
 GENDER = "gender"
-
 LIKELY_PEOPLE = 20
 """More people than these with fewer than a quarter as many frames are frames first, unless shapes say otherwise."""
 

@@ -82,13 +82,8 @@ def without_gaps(
 ) -> tuple[list[Doubles], NDArray[np.bool_], tuple[str, ...]]:
     """One person's numbers with frames that hold NaN or infinity filled by those before them.
 
-    Args:
-        where: the file, and whose numbers they are.
-        *parts: (T, ...) each.
-        lost: what happens to such frames, for the note on them.
-
-    Returns:
-        The parts; (T,) which frames the file has; and a note where it lacks some.
+    (T, ...) each -> the same; (T,) which frames the file has; and a note where it lacks some, which says what happens
+    to them, `lost`.
 
     Raises:
         DataError: it has none.

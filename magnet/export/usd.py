@@ -36,13 +36,10 @@ def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
 
     Each person present is `/scene/person_0` ..., numbered by slot, with a skeleton of 22 joints, on the floor at rest,
     its animation and a mesh skinned to it in the slot's colour. The suffix says which kind of USD: text (.usda), binary
-    (.usdc) or packed (.usdz).
+    (.usdc) or packed (.usdz). Returns the path written.
 
     Args:
         bones: names and hierarchy of joints; USD always has one animation per skeleton.
-
-    Returns:
-        The path written.
 
     Raises:
         ImportError: usd-core is not installed.

@@ -60,7 +60,7 @@ def render_video(
     speed: float = 1.0,
     progress: bool | Report = False,
 ) -> Path:
-    """Write a film of one scene, or of several side by side at one scale and from one side.
+    """Write a film of one scene, or of several side by side at one scale and from one side. Returns the path written.
 
     Args:
         scenes: a scene, each of its B a panel, or labelled scenes; all of one length and frame rate.
@@ -76,9 +76,6 @@ def render_video(
         trail: seconds of each pelvis's path that are drawn on the floor.
         speed: seconds of the scene per second of the film.
         progress: True for a progress bar, or a function called with (done, all) after each frame.
-
-    Returns:
-        The path written.
 
     Raises:
         ValueError: unknown suffix, odd size, no frame rate, or scenes that cannot be drawn; says which and why.

@@ -332,10 +332,7 @@ def split_gaps(clips: Mapping[Split, Mapping[int, int]], limited: bool = False) 
     """A sentence for every gap, then what to do; none where every split has clips of every number of people.
 
     Somebody alone is no gap where others are together: data sets hold such clips to learn bodies from.
-
-    Args:
-        clips: number of clips by number of people, of each split that has any.
-        limited: not all takes were asked for (`--limit`).
+    clips: their number by number of people, of each split that has any; limited: not all takes were asked for.
     """
     counts = {split: {n: count for n, count in clips.get(split, {}).items() if count} for split in SPLITS}
     if not any(counts.values()):

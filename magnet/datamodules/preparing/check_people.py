@@ -138,10 +138,7 @@ def _far(places: Array) -> Bools:
 def frozen(still_place: Bools, still_pose: Bools, valid: Bools) -> list[Flag]:
     """Flags people who are held still while others move.
 
-    Args:
-        still_place: (T - 1, P) whether the pelvis is where it was in the frame before.
-        still_pose: (T - 1, P) whether all joints are turned as in the frame before.
-        valid: (T, P).
+    still_place, still_pose: (T - 1, P) whether the pelvis is where it was in the frame before, and joints as they were.
     """
     both = valid[1:] & valid[:-1]
     kinds: tuple[tuple[Bools, int, str], ...] = (

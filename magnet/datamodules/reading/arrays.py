@@ -41,13 +41,7 @@ def open_npy(path: Path) -> NDArray:
 
 
 def open_npz(path: Path, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray]:
-    """Arrays of an npz file without pickles; no others are unpacked.
-
-    Args:
-        path: the file.
-        keys: what it must have.
-        optional: what is read if it is there and holds no pickle.
-    """
+    """Arrays of an npz file without pickles, those of `keys` and `optional` alone; the latter if they are there."""
     with reported(path, "an npz archive"), load_npz(path, (*keys, *optional)) as file:
         require(path, file.files, keys)
         arrays = {key: file[key] for key in keys}
@@ -156,12 +150,7 @@ OR_YOURS = ", or give your own with --splits FILE"
 
 
 def listed_splits(files: Mapping[Split, Path], clean: Callable[[str], str] = str) -> dict[str, Split]:
-    """The split of every name in one list a split.
-
-    Args:
-        files: one list a split; those that are not there are empty.
-        clean: what to make of a line.
-    """
+    """The split of every name in one list a split; a list that is not there is empty. clean: what to make of a line"""
     splits: dict[str, Split] = {}
     for split, path in files.items():
         for name in map(clean, open_names(path)) if path.is_file() else ():

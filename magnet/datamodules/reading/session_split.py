@@ -36,9 +36,6 @@ def split_sessions(sessions: Mapping[str, Amounts], fixed: Mapping[str, Split] |
     Args:
         sessions: frames of scenes by number of people, of each session.
         fixed: sessions whose split is settled already; they count, but do not move.
-
-    Returns:
-        The split of each of `sessions`; of `fixed` ones the settled one.
     """
     fixed = {name: split for name, split in (fixed or {}).items() if name in sessions}
     names = sorted(sessions, key=lambda name: (hashlib.sha256(name.encode(errors="replace")).digest(), name))

@@ -44,7 +44,7 @@ def save_html(
     title: str = "",
     styles: tuple[Style, ...] | None = None,
 ) -> Path:
-    """Write scenes as a self-contained web page with its own small player.
+    """Write scenes as a self-contained web page with its own small player. Returns the path written.
 
     Args:
         scene: each of its B a take, or takes; several stand side by side, and each can be looked at alone.
@@ -54,9 +54,6 @@ def save_html(
         styles: looks to choose from, the first one first. By default body (light bodies of a crowd), capsules and
             skeleton, but no skin of a body that is not the open one: the file would carry a model that its owner may
             not pass on. Name "body" or "light" to have it all the same.
-
-    Returns:
-        The path written.
 
     Raises:
         ValueError: a path that is not .html, nobody there, takes of several frame rates, no such style, or another

@@ -103,8 +103,7 @@ def titled(takes: Sequence[ShownTake], most: int = 3) -> str:
 def same_length(one: ShownTake, other: ShownTake) -> Scene:
     """The scene of `one`, cut or held so that it has the frames of `other`."""
     frame = torch.arange(other.frames).clamp(max=one.frames - 1)
-    scene = one.scene
-    return scene.frames_at(frame)
+    return one.scene.frames_at(frame)
 
 
 def in_a_row(takes: Sequence[ShownTake]) -> list[Array]:
