@@ -19,6 +19,11 @@ VERSIONS: dict[str, str] = {}
 """Of the installed packages whose entry points have been loaded in this process, by the package's name."""
 
 
+def same_definition(kind: type, other: type) -> bool:
+    """Whether two classes are of the same place in a program, which may have run twice."""
+    return (kind.__module__, kind.__qualname__) == (other.__module__, other.__qualname__)
+
+
 @dataclass(frozen=True)
 class Registered:
     """A class and where it came from.
@@ -66,7 +71,7 @@ class Registry:
         self.discovered = False
 
     def add(self, name: str, kind: type, origin: str) -> None:
-        """Make a class known.
+        """Make a class known, in place of itself as it was, where its definition runs again (a notebook's cell).
 
         Raises:
             TypeError: it is not of the sort.
@@ -74,7 +79,7 @@ class Registry:
         """
         self.check(name, kind)
         known = self.known.get(name)
-        if known is not None and known.kind is not kind:
+        if known is not None and not same_definition(kind, known.kind):
             raise ValueError(f"{self.what} name {name} is taken by {known.kind.__module__}.{known.kind.__qualname__}")
         self.known[name] = Registered(name, kind, origin)
 

@@ -13,7 +13,7 @@ from typing import TypeVar, get_args
 from lightning.pytorch import LightningDataModule
 
 from magnet.datamodules.reading.recording import Family, Reader
-from magnet.plugins import Failed, Registered, Registry, attempted, look_here, subclasses, told
+from magnet.plugins import Failed, Registered, Registry, attempted, look_here, same_definition, subclasses, told
 
 BUILT_IN = (
     "synthetic",
@@ -56,7 +56,7 @@ def _check_reader(kind: type) -> None:
     if wrong := _wrong_parts(kind):
         raise TypeError(f"reader {kind.__module__}.{kind.__qualname__} {' and '.join(wrong)}; see docs/own.md")
     for known in _known_readers():
-        if known.name == kind.name and known is not kind:
+        if known.name == kind.name and not same_definition(kind, known):
             raise ValueError(f"reader name {kind.name} is taken by {known.__module__}.{known.__qualname__}")
 
 

@@ -54,6 +54,23 @@ def test_an_installed_package_adds_its_task(clean_registry, monkeypatch):
     assert registry.get("duel") is Foreign
 
 
+def test_a_class_whose_definition_runs_again_takes_the_place_of_itself(clean_registry):
+    """As a notebook's cell does, after something in it was changed."""
+
+    def cell() -> type:
+        @registry.register_task("duel")
+        @dataclasses.dataclass(frozen=True)
+        class Duel(Foreign):
+            pass
+
+        return Duel
+
+    first, again = cell(), cell()
+    assert registry.get("duel") is again is not first
+    with pytest.raises(ValueError, match=r"name duel is taken by .*cell\.<locals>\.Duel"):
+        registry.register_task("duel")(Foreign)
+
+
 def test_a_name_that_options_would_read_as_a_path_is_refused(clean_registry, monkeypatch):
     monkeypatch.setattr(plugins, "entry_points", lambda group: [FakePoint("Their.duel", lambda: Foreign)])
     registry.discover(again=True)
