@@ -85,6 +85,13 @@ class WeightEMA(WeightAveraging):
         yield from zip(module.parameters(), pl_module.parameters(), strict=True)
         yield from zip(module.buffers(), pl_module.buffers(), strict=True)
 
+    def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Before the first step the average is the model as it is now, with what it has learnt of its data since."""
+        if self._average_model is not None and not int(self._average_model.n_averaged):
+            with torch.no_grad():
+                for average, current in self._pairs(pl_module):
+                    average.copy_(current)
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._own = None
         super().on_train_start(trainer, pl_module)
