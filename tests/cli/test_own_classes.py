@@ -56,7 +56,7 @@ class Needy(MotionDataModule):
     def __init__(self, folder: str, **kwargs):
         super().__init__(**kwargs)
 
-class Rings(Callback):
+class Beeps(Callback):
     def __init__(self, every: int):
         pass
 """
@@ -68,8 +68,8 @@ class Rings(Callback):
         (["--data", "classes_of_mine.Needy"], "Needy needs --data.folder, which is not given"),
         (["--lr_scheduler", "StepLR"], "StepLR needs --lr_scheduler.step_size, which is not given"),
         (
-            ["--trainer.callbacks", "classes_of_mine.Rings"],
-            "Rings needs every, which is not given; it belongs under its",
+            ["--trainer.callbacks", "classes_of_mine.Beeps"],
+            "Beeps needs every, which is not given; it belongs under its",
         ),
     ],
 )
