@@ -11,7 +11,7 @@ from magnet.body import load_body
 from magnet.body.contact import deepest
 from magnet.body.holding import holds
 from magnet.body.joints import TOES
-from magnet.body.settle import DOFS, LEAD
+from magnet.body.settle import DOFS, LEAD, corrected
 from magnet.body.settle_wishes import LAG
 from magnet.generation import live_settling
 from magnet.generation.causal_bodies import EXPECTED
@@ -61,18 +61,19 @@ def test_who_is_a_little_deep_is_not_thrown_out(
     ahead, push = scene.slice(BLOCK), pushed(BLOCK + BEHIND, 0.3, over)
     asked: list[object] = []
 
-    def made(
+    def answer(
         few: Scene, body: object, how: str, fixed: Tensor, settle: object, *rest: object, **more: object
     ) -> Tensor:
         asked.append(settle)
         return push.clone() if settle is PRESSED[-1] else torch.zeros_like(push)
 
-    monkeypatch.setattr(live_settling, "settling", made)
+    monkeypatch.setattr(live_settling, "settling", answer)
     new, sees = torch.tensor([True, False]).expand(BLOCK + BEHIND, -1), torch.zeros(2, 2, dtype=torch.bool)
-    _, now = settled_on(ahead, scene.slice(0, BLOCK), new, BLOCK, sees, "firm", None)
+    made, now = settled_on(ahead, scene.slice(0, BLOCK), new, BLOCK, sees, "firm", None)
     assert asked[-1] is PRESSED[-1] and now.ahead is not None
-    whole = torch.cat([now.offset, now.ahead], dim=1)
-    assert torch.equal(whole, push[:, BLOCK - LEAD :] if goes else torch.zeros_like(whole))
+    offset = push if goes else torch.zeros_like(push)
+    assert torch.equal(torch.cat([now.offset, now.ahead], dim=1), offset[:, BLOCK - LEAD :])
+    assert torch.equal(made.T_world_root, corrected(ahead, offset).T_world_root)
 
 
 def test_each_correction_goes_on_from_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
