@@ -19,7 +19,7 @@ from magnet.datamodules.preparing import check
 from magnet.datamodules.preparing.prepare import absent_note, prepare, read_splits, summary_of
 from magnet.datamodules.preparing.progress import progress_bar
 from magnet.datamodules.reading import download
-from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
+from magnet.datamodules.store.reader import StoreReader, holds_store
 from magnet.errors import counted
 from magnet.files import CannotWrite, require_place, writing
 
@@ -65,7 +65,7 @@ def run_info(given: argparse.Namespace) -> int:
 
 def run_check(given: argparse.Namespace) -> int:
     path = Path(needed(given, "path")[0]).expanduser()
-    if (path / MANIFEST).exists() or (path / STATE).is_dir():
+    if holds_store(path):
         picture = picture_of(given, StoreReader(path).manifest["name"])
         found, body = checked_store(given, path)
     elif not path.is_dir():

@@ -16,7 +16,7 @@ from magnet.datamodules.preparing.convert import ConvertedTake, PrepareJob, conv
 from magnet.datamodules.preparing.pack import PackSource, pack
 from magnet.datamodules.preparing.progress import Tell
 from magnet.datamodules.reading.recording import DataError, Reader, Take
-from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json
+from magnet.datamodules.store.reader import MANIFEST, STATE, StoreError, StoreReader, as_json, holds_store
 from magnet.errors import counted, first_names
 from magnet.files import CannotWrite, alone, file_hash, write_whole, writing
 
@@ -233,7 +233,7 @@ def opened(out: Path, reader: Reader) -> StoreReader | None:
         raise ValueError(f"{out} is a file, expected a folder; choose another --out")
     if not out.exists() or not any(out.iterdir()):
         return None
-    if not (out / MANIFEST).exists() and not (out / STATE).is_dir():
+    if not holds_store(out):
         raise ValueError(f"{out} is not empty and holds no store; choose another --out")
     try:
         folder = StoreReader(out)

@@ -35,6 +35,22 @@ class StoreError(ValueError):
     """A folder is no store, is damaged, or is of a later version; the message says what to do."""
 
 
+def holds_store(path: Path) -> bool:
+    """Whether a folder is a store, finished or damaged; a manifest.json of another program does not make it one."""
+    if (path / STATE).is_dir():
+        return True
+    try:
+        return _is_manifest(json.loads((path / MANIFEST).read_text(encoding="utf-8")))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (OSError, ValueError):
+        return True
+
+
+def _is_manifest(found: object) -> bool:
+    return isinstance(found, dict) and "format" in found
+
+
 def body_hash(body: Body) -> str:
     """A hash of a body's joints at rest, which identifies the body whatever its file is called."""
     joints = body.J_template.numpy().tobytes() + body.J_shapedirs.numpy().tobytes()
@@ -204,7 +220,6 @@ class StoreReader:
         self.path = Path(path).expanduser()
         try:
             self.manifest: dict[str, Any] = json.loads((self.path / MANIFEST).read_text(encoding="utf-8"))
-            version = self.manifest["format"]
         except FileNotFoundError as error:
             if not self.path.exists():
                 here = "" if self.path.is_absolute() else f" in {Path.cwd()}, where paths of a configuration count from"
@@ -215,10 +230,15 @@ class StoreReader:
             raise StoreError(
                 f"{self.path} is not a prepared store: it has no {MANIFEST}; {_advice(self.path)}"
             ) from error
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError) as error:
             raise StoreError(f"{self.path / MANIFEST} cannot be read ({error}); prepare the store again") from error
-        if version != FORMAT:
-            raise StoreError(f"{self.path}: store format {version}, this version reads {FORMAT}; prepare it again")
+        if not _is_manifest(self.manifest):
+            raise StoreError(
+                f"{self.path} is not a prepared store: its {MANIFEST} is of another program; {_advice(self.path)}"
+            )
+        if self.manifest["format"] != FORMAT:
+            its = self.manifest["format"]
+            raise StoreError(f"{self.path}: store format {its}, this version reads {FORMAT}; prepare it again")
         self.body: str = self.manifest["body"]["id"]
         self._splits: dict[tuple[Split, tuple[str, ...]], StoreSplit] = {}
 

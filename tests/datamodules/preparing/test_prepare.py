@@ -260,6 +260,9 @@ def test_strangers_folders_are_left_alone(order, tmp_path):
     (tmp_path / "mine/thesis.tex").write_text("years of work")
     with pytest.raises(ValueError, match="not empty and holds no store"):
         prepare(order, tmp_path / "mine")
+    (tmp_path / "mine/manifest.json").write_text('[{"file": "thesis.tex"}]')
+    with pytest.raises(ValueError, match="not empty and holds no store"):
+        prepare(order, tmp_path / "mine")
     prepare(order, tmp_path / "store")
     manifest = json.loads((tmp_path / "store/manifest.json").read_text())
     (tmp_path / "store/manifest.json").write_text(json.dumps({**manifest, "name": "other", "title": "Other"}))
