@@ -90,14 +90,6 @@ def test_a_picture_that_cannot_be_written_is_said_before_the_work(what, copy, mo
     assert "dd100_check.png: is a folder, expected" in said.err and "--picture none" in said.err and not said.out
 
 
-def test_a_list_of_another_program_makes_no_store_of_a_download(copy, capsys):
-    (copy / "dl/manifest.json").write_text('[{"file": "leader.npz", "format": "npz"}]')
-    assert cli.main(["data", "check", "dl", "--body", "dl/body.npz", "--picture", "none"]) == 0
-    assert "all assertions hold" in capsys.readouterr().out
-    assert cli.main(["data", "info", "dl"]) == 2
-    assert "its manifest.json is of another program; make one with" in capsys.readouterr().err
-
-
 def test_a_check_is_drawn_with_the_open_body_where_the_own_is_not_given(copy, capsys):
     assert cli.main(["data", "check", "store", "--picture", "seen.png"]) == 0
     assert "picture: seen.png" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.convert import PrepareJob, convert, encode
 from magnet.datamodules.preparing.prepare import prepare
 from magnet.datamodules.reading.recording import Recording
-from magnet.datamodules.store.reader import StoreError, StoreReader
+from magnet.datamodules.store.reader import StoreError, StoreReader, holds_store
 from magnet.datamodules.store.rows import ROW, decode
 from magnet.testing import random_scene
 from tests.datamodules import made
@@ -110,6 +111,19 @@ def test_what_is_no_store_is_refused_with_the_command(store, tmp_path):
     later.write_text(json.dumps({**json.loads((store / "manifest.json").read_text()), "format": 99}))
     with pytest.raises(StoreError, match="store format 99, this version reads 1"):
         StoreReader(tmp_path)
+
+
+def test_a_list_of_another_program_makes_no_store_of_a_folder(store, tmp_path):
+    assert holds_store(store) and not holds_store(tmp_path) and not holds_store(tmp_path / "gone")
+    shutil.copy(store / "manifest.json", tmp_path)
+    assert holds_store(tmp_path)
+    for list_of_files in ('[{"file": "leader.bvh"}]', '{"files": ["leader.bvh"]}'):
+        (tmp_path / "manifest.json").write_text(list_of_files)
+        assert not holds_store(tmp_path)
+        with pytest.raises(StoreError, match=r"its manifest\.json is of another program; make one with"):
+            StoreReader(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"format": 1, "cli')
+    assert holds_store(tmp_path)  # a store's, cut short: it is prepared again
 
 
 def test_any_store_can_be_read_without_its_own_class_but_not_by_anothers(store):
