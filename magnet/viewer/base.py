@@ -17,7 +17,7 @@ from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.scenery import Floor
-from magnet.viewer.server import TOLD, start
+from magnet.viewer.server import TOLD, literal, start
 from magnet.viewer.timeline import Timeline, Tracks
 
 RATE = FPS
@@ -321,7 +321,7 @@ class ViewerBase:
             if self.render.collisions and facts.get("deepest", 0.0) > 0:
                 state += f" · **{100 * facts['deepest']:.0f} cm inside each other**"
             state = state.removeprefix(" · ")
-            lines.append(f"{view.take.label}: {state}" if state and len(self.views) > 1 else state)
+            lines.append(f"{literal(view.take.label)}: {state}" if state and len(self.views) > 1 else state)
         return "  \n".join(filter(None, lines))
 
     def settle(self, now: float) -> None:

@@ -8,7 +8,9 @@ import http
 import ipaddress
 import math
 import os
+import re
 import socket
+import string
 import sys
 from collections.abc import AsyncIterator, Iterator
 from typing import Any, cast
@@ -157,6 +159,15 @@ def not_offered(control: Any, value: object) -> str:
     else:
         return ""
     return "" if fits else f"{getattr(control, 'label', 'a control')}: got {repr(value)[:LONG]}, expected {expected}"
+
+
+def literal(name: str) -> str:
+    """A name as Markdown that shows it sign by sign: viser's page runs the HTML in it, and names come out of files.
+
+    >>> print(literal("<b> of *two*"))
+    \\<b\\> of \\*two\\*
+    """
+    return re.sub(f"[{re.escape(string.punctuation)}]", r"\\\g<0>", name)
 
 
 def require_viser() -> Any:

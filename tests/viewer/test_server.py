@@ -136,6 +136,25 @@ def test_a_format_that_there_is_not_writes_no_file(kind: str, folder: Path, duet
     assert [each.name for each in folder.rglob("*")] == ["temporary"]
 
 
+def test_a_name_out_of_a_file_is_text_on_the_page(duet: Scene, body: Body) -> None:
+    """Markdown takes HTML as it is, so that a name could run a script in the page, or load what a stranger offers."""
+    pytest.importorskip("viser")
+    from markdown_it import MarkdownIt
+
+    from magnet.viewer.watch import Viewer
+
+    names = ["<iframe srcdoc='<script>1</script>'/>", "![a](http://evil.example/a.png)", "*a* _b_ `c` &lt; \\<b>"]
+    viewer = Viewer([take(name, duet, context=8) for name in names], body, port=0)
+    try:
+        (said,) = (block.children or [] for block in MarkdownIt().parse(viewer.caption(0)) if block.children)
+    finally:
+        viewer.stop()
+    emphasis = {"strong_open", "strong_close", "hardbreak"}  # our own
+    assert {part.type for part in said} - emphasis == {"text"}
+    shown = "".join(part.content for part in said)
+    assert all(name in shown for name in names)
+
+
 @pytest.mark.parametrize(
     ("told", "seen"),
     [
