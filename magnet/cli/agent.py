@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnet.cli import scene_files
 from magnet.cli.errors import CommandError
 from magnet.cli.flags import PlainParser
 
@@ -93,6 +94,7 @@ def main(arguments: Sequence[str] = ()) -> int:
 
     if given.out is not None:
         given.out = npz_path(given.out, "of it `magnet export` makes other formats")
+        scene_files.require_unread(given.out, list(filter(None, (given.scene, given.play))), [1])
     for out in filter(None, (given.out, given.report)):  # written when it is over
         require_place(out)
     torch.set_num_threads(given.threads)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -112,6 +113,7 @@ def truth_of(options: argparse.Namespace, body: Body, fps: float) -> ShownTake |
 
 def record_denoising(options: argparse.Namespace, scene: Scene) -> None:
     """Write the steps in which a model goes on from a scene."""
+    scene_files.require_unread(Path(options.record), [*options.files, *filter(None, [options.truth])], [1])
     task = registry.get(options.task)()
     given = options.context // TOKEN_FRAMES
     try:  # before a model is loaded

@@ -178,6 +178,8 @@ def test_a_numbered_npz_is_none_of_many(folder: Path) -> None:
         ["refine", "duet.npz", "other.npz", "--shapes", "other.npz"],
         ["predict", "take_person0.bvh", "--out", "take_person0.bvh"],
         ["predict", "duet.npz", "--out", "o.glb", "duet.npz"],
+        ["agent", "--name", "A", "--listen", "ipc://a", "--scene", "duet.npz", "--out", "duet"],
+        ["agent", "--name=A", "--listen=ipc://a", "--scene=duet.npz", "--play=other.npz", "--out=other.npz"],
     ],
     ids=" ".join,
 )

@@ -189,6 +189,18 @@ def test_a_page_is_not_recorded(tmp_path: Path, duet: Scene, capsys) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["a.npz"]
 
 
+@pytest.mark.parametrize("read", ["a.npz", "b.npz --truth a.npz"])
+def test_a_recording_does_not_take_the_place_of_a_file_that_is_read(
+    read: str, tmp_path: Path, duet: Scene, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("magnet.denoiser.core.DenoiserCore.load", lambda *_: pytest.fail("a model was loaded"))
+    before = [duet.save(name).read_bytes() for name in ("a.npz", "b.npz")]
+    assert main(["view", *read.split(), "--context", "16", "--record", "a", "--port", "0"]) == 2
+    assert "a.npz: is read, and would be written over" in capsys.readouterr().err
+    assert [Path(name).read_bytes() for name in ("a.npz", "b.npz")] == before
+
+
 def test_a_recording_that_needs_a_past_is_refused_before_a_model_is_loaded(
     tmp_path: Path, duet: Scene, capsys, monkeypatch
 ) -> None:
