@@ -354,7 +354,7 @@ def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(file, **arrays)
 
 
-DAMAGED = (EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
+DAMAGED = (EOFError, OverflowError, RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
 """What reading a damaged npz raises besides `ValueError`: of its archive, its packed numbers, its arrays' heads."""
 
 

@@ -270,10 +270,15 @@ def damaged(path: Path, how: str) -> Path:
             begin = place + 30 + sum(struct.unpack_from("<HH", data, place + 26))
             data[begin : begin + 8] = b"\xff" * 8
     path.write_bytes(data)
-    if how == "of no type":
+    heads = {
+        "of no type": "{'descr': (\n",
+        "of no size": f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({10**20},)}}\n",
+    }
+    if how in heads:
         with zipfile.ZipFile(path, "w") as archive:
             for name in names:
-                archive.writestr(name, np.lib.format.magic(1, 0) + struct.pack("<H", 12) + b"{'descr': (\n")
+                head = heads[how].encode()
+                archive.writestr(name, np.lib.format.magic(1, 0) + struct.pack("<H", len(head)) + head)
     return path
 
 
@@ -287,7 +292,9 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("how", ["cut short", "of another sum", "locked", "packed otherwise", "of no type"])
+@pytest.mark.parametrize(
+    "how", ["cut short", "of another sum", "locked", "packed otherwise", "of no type", "of no size"]
+)
 @pytest.mark.parametrize("kind", READERS)
 def test_a_damaged_npz_is_told_as_one_by_whoever_reads_it(kind: str, how: str, tmp_path: Path) -> None:
     written = written_by_each(tmp_path)

@@ -50,7 +50,7 @@ class GltfFile:
             self.document, self.binary = _opened(data)
             self.nodes: list[dict[str, Any]] = self.document.get("nodes", [])
             packed = set(self.document.get("extensionsRequired", [])) & set(PACKED)
-        except (ValueError, struct.error, AttributeError, KeyError, TypeError) as error:
+        except (ValueError, struct.error, AttributeError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{path}: not a whole {path.suffix.lower()} file ({error}): export it again") from error
         if packed:
             raise ValueError(f"{path}: its motion is compressed ({min(packed)}): export it without compression")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body import Body
+from magnet.errors import first_names
 from magnet.export.bvh import person_file
 from magnet.export.rig import UNITS, UP, require_unit, require_up
 from magnet.export.smpl_keys import (
@@ -39,6 +41,8 @@ from magnet.motion.scene import BODY_JOINTS, Scene
 _Held = tuple[dict[str, Tensor], float, str | None, str]
 """Arrays by our keys, frames a second, the body that a file was written for if it says so, and its name."""
 SMPLX_JOINTS = 55
+SHOWN = 20
+"""Keys of a file that are named where some are missing."""
 STANDING, LYING = (0.4, 1.4), 0.15
 """Metres of a pelvis over the floor: of who stands or sits, and at least."""
 HIGHEST, MOST_TURNED = 30.0, 9.0
@@ -137,7 +141,9 @@ def read_smplx(
     try:
         with load_npz(path) as archive:
             arrays = _arrays(path, archive, in_fps)
-    except (OSError, *DAMAGED) as error:
+    except (OSError, ValueError, *DAMAGED) as error:
+        if str(error).startswith(str(path)):  # of what it holds
+            raise
         raise ValueError(f"{path}: not a readable npz ({error}); copy or download it again") from error
     return _scene_of(path, arrays, body, up, unit)
 
@@ -342,7 +348,11 @@ def _arrays(where: str | Path, held: Mapping[str, Any], in_fps: float | None) ->
             raise ValueError(f"{where}: given: got {given.dtype} {given.shape}, expected bool {expected}")
         tensors["given"] = torch.from_numpy(given)
     written_for = str(held["body"]) if ours else None
-    return tensors, fps, written_for, str(held["name"]) if "name" in there else ""
+    name = ""
+    if "name" in there:
+        with suppress(ValueError):  # pickled in an npz, and not needed
+            name = str(held["name"])
+    return tensors, fps, written_for, name
 
 
 def _require_keys(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> None:
@@ -357,7 +367,7 @@ def _require_keys(where: str | Path, held: Mapping[str, Any], in_fps: float | No
         fix = "; say the frames a second: --in_fps 30 (in_fps=30)" if unrated else ""
         if not whole and not first_of(PLACE, there):
             fix = "; positions of joints are read from a table, .csv (docs/export.md)" + fix
-        raise ValueError(f"{where}: lacks {', '.join(missing)}; it has {', '.join(sorted(own))}{fix}")
+        raise ValueError(f"{where}: lacks {', '.join(missing)}; it has {first_names(sorted(own), SHOWN)}{fix}")
 
 
 def _rate(where: str | Path, held: Mapping[str, Any], in_fps: float | None) -> float:

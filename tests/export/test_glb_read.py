@@ -200,6 +200,9 @@ def test_what_is_no_glb_or_cut_short_is_refused_in_one_line(duet: Scene, body: B
         path.write_bytes(data)
         with pytest.raises(ValueError, match=r"a\.glb: not a whole \.glb file \(it .+\): export it again"):
             read_glb(path)
+    (tmp_path / "a.gltf").write_text('{"asset":' + 10**5 * "[")
+    with pytest.raises(ValueError, match=r"a\.gltf: not a whole \.gltf file \(.+\): export it again"):
+        read_glb(tmp_path / "a.gltf")
 
 
 @pytest.mark.parametrize(

@@ -221,6 +221,25 @@ def test_lengths_in_centimetres_are_refused_until_they_are_called_so(tmp_path: P
         read_smplx(path, body, unit="parsec")
 
 
+def test_what_is_pickled_in_an_npz_names_the_file_and_is_passed_over_where_it_is_not_needed(
+    trio: Scene, body: Body, tmp_path: Path
+) -> None:
+    (path,) = save_smplx(trio, tmp_path / "trio.npz", body)
+    with np.load(path) as file:
+        held = dict(file)
+    np.savez(path, **{**held, "name": np.array(None)})  # type: ignore[arg-type]
+    assert load_smplx(path, body).names == ()
+    np.savez(path, **{**held, "body": np.array(None)})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"trio\.npz: not a readable npz \(Object arrays"):
+        load_smplx(path, body)
+
+
+def test_of_many_arrays_under_other_names_the_first_are_named(body: Body, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **{f"take_{k:04}": np.zeros(1) for k in range(3000)})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"it has take_0000, .*, take_0019 and 2980 more; "):
+        load_smplx(tmp_path / "a.npz", body)
+
+
 def test_turns_in_degrees_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"turns of up to .* radians; degrees"):
         read_smplx(scaled(tmp_path, radians=180 / np.pi), load_body())
