@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as serialized
 from torch import Tensor
 
 from magnet.files import file_hash, inside, sync, write_whole, writing
@@ -309,11 +310,8 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
     with writing(folder, advice), tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as name:
         aside, listed = Path(name), []
         for number, part in enumerate(_in_parts(checkpoint["state_dict"], half), 1):
-            file = aside / f"weights-{number:02d}.safetensors"
-            save_file(part, file)
-            file.chmod(0o644)  # safetensors writes for the owner alone
-            sync(file)
-            listed.append({"file": file.name, "sha256": file_hash(file)})
+            called, digest = write_whole(aside, f"weights-{number:02d}.safetensors", serialized(part), advice=advice)
+            listed.append({"file": called, "sha256": digest})
         config = {
             "format": FORMAT,
             "steps": int(checkpoint.get("global_step", 0)),

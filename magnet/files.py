@@ -217,11 +217,12 @@ def write_whole(
     Raises:
         CannotWrite: the disk is full, or the folder does not take files; nothing is left behind.
     """
+    aside = folder / f".new-{secrets.token_hex(8)}"
     with writing(folder, advice):
-        handle, aside = tempfile.mkstemp(prefix=".new-", dir=folder)
+        opened = aside.open("xb")  # for others to read where the umask lets them
     try:
         with writing(folder, advice):
-            with os.fdopen(handle, "wb") as file:
+            with opened as file:
                 hashed = HashedFile(file)
                 try:
                     hashed.write(content) if isinstance(content, bytes) else content(hashed)
@@ -230,13 +231,12 @@ def write_whole(
                 file.flush()
                 os.fsync(file.fileno())
             digest = hashed.digest.hexdigest()
-            os.chmod(aside, 0o644)
             if ready is not None:
                 ready(digest)
             called = name if isinstance(name, str) else name(digest)
             os.replace(aside, folder / called)
     except BaseException:
-        Path(aside).unlink(missing_ok=True)
+        aside.unlink(missing_ok=True)
         raise
     sync(folder)
     return called, digest

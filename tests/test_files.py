@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet import files
+from magnet import checkpoints, files
 from magnet.body import load_body
 from magnet.evaluation.benchmark import Benchmark
 from magnet.evaluation.submission import Submission
@@ -150,6 +150,19 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path: Path) -> None:
     assert kept.read_text() == "after" and kept.stat().st_mode & 0o777 == 0o640
     (tmp_path / "plain").touch()
     assert write_text(tmp_path / "other", "").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_files_are_for_whom_the_umask_lets(umask: int, tmp_path: Path) -> None:
+    before = os.umask(umask)
+    try:
+        write_whole(tmp_path, "whole", b"")
+        write_text(tmp_path / "text", "")
+        checkpoints.write({"state_dict": {"weight": torch.zeros(1)}}, tmp_path / "model")
+    finally:
+        os.umask(before)
+    written = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(written) == 4 and {path.stat().st_mode & 0o777 for path in written} == {0o666 & ~umask}
 
 
 def test_what_is_no_plain_file_is_written_as_it_is() -> None:

@@ -70,19 +70,15 @@ def test_a_release_that_was_there_stays_whole_where_the_new_one_is_not(checkpoin
     before = whole(folder)
     monkeypatch.setattr(checkpoints, "PART_BYTES", 10_000)  # two parts
     other = {**checkpoint, "state_dict": {str(i): torch.randn(50, 40) for i in range(4)}}
-    save_file, write_whole, written = checkpoints.save_file, checkpoints.write_whole, []
+    write_whole, written = checkpoints.write_whole, []
 
-    def write(real):
-        def until_the_disk_is_full(*args, **kwargs):
-            written.append(args)
-            if len(written) > full:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return real(*args, **kwargs)
+    def until_the_disk_is_full(*args, **kwargs):
+        written.append(args)
+        if len(written) > full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write_whole(*args, **kwargs)
 
-        return until_the_disk_is_full
-
-    monkeypatch.setattr(checkpoints, "save_file", write(save_file))
-    monkeypatch.setattr(checkpoints, "write_whole", write(write_whole))
+    monkeypatch.setattr(checkpoints, "write_whole", until_the_disk_is_full)
     with pytest.raises(CannotWrite, match="the disk is full"):
         checkpoints.write(other, folder)
     assert len(written) == full + 1 and whole(folder) == before
