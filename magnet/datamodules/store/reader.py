@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from magnet.body import Body
 from magnet.datamodules.clip import SPLITS, Clip, Ints, Split
 from magnet.datamodules.store.rows import ROW, encode, scene_of
-from magnet.files import inside
+from magnet.files import DAMAGED, inside
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -153,7 +153,7 @@ class StoreSplit:
             path, begin = self.files[number], int(self.ends[number - 1]) if number else 0
             try:
                 rows = np.load(path, mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError, EOFError) as error:
+            except (OSError, ValueError, *DAMAGED) as error:
                 raise StoreError(f"{path}: the shard cannot be read ({error}); prepare the store again") from error
             if rows.dtype != ROW or rows.shape != (self.ends[number] - begin,):
                 raise StoreError(
@@ -258,7 +258,7 @@ class StoreReader:
         path = self._file(self.manifest[entry])
         try:
             return read(path)
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, *DAMAGED) as error:
             raise StoreError(f"{path}: the {entry} cannot be read ({error}); prepare the store again") from error
 
     def _file(self, entry: Any) -> Path:

@@ -79,7 +79,7 @@ def body_joints(recording: Recording) -> torch.Tensor:
     return BODY.forward_kinematics(rotations[:, :, 1:], T_world_root, betas)
 
 
-@pytest.mark.parametrize("spoil", ["missing", "cut", "other"])
+@pytest.mark.parametrize("spoil", ["missing", "cut", "other", "of an open head"])
 def test_a_damaged_shard_is_named(store, spoil, tmp_path):
     copy = tmp_path / "store"
     copy.mkdir()
@@ -90,8 +90,13 @@ def test_a_damaged_shard_is_named(store, spoil, tmp_path):
     shard = sorted(copy.glob("train-*.npy"))[0]
     content = shard.read_bytes()
     shard.unlink()
+    spoilt = {
+        "cut": content[: len(content) // 2],
+        "other": b"no array at all",
+        "of an open head": content.replace(b"}", b" ", 1),
+    }
     if spoil != "missing":
-        shard.write_bytes(content[: len(content) // 2] if spoil == "cut" else b"no array at all")
+        shard.write_bytes(spoilt[spoil])
     with pytest.raises(StoreError, match=f"{shard.name}.*prepare the store again"):
         data(copy).store("train")
 
