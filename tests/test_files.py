@@ -272,6 +272,8 @@ def damaged(path: Path, how: str) -> Path:
     entries = [match.start() for match in re.finditer(b"PK\x01\x02", data)]  # of the list of members at its end
     if how == "cut short":
         del data[len(data) // 2 :]
+    elif how == "without a part":
+        del data[60:90]
     elif how == "of another sum":
         for entry in entries:
             data[entry + 16] ^= 0xFF
@@ -306,7 +308,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize(
-    "how", ["cut short", "of another sum", "locked", "packed otherwise", "of no type", "of no size"]
+    "how", ["cut short", "without a part", "of another sum", "locked", "packed otherwise", "of no type", "of no size"]
 )
 @pytest.mark.parametrize("kind", READERS)
 def test_a_damaged_npz_is_told_as_one_by_whoever_reads_it(kind: str, how: str, tmp_path: Path) -> None:

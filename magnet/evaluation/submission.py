@@ -87,7 +87,7 @@ class Submission:
                     there = ", ".join(sorted(file.files)) or "nothing"
                     raise ValueError(f"{path}: lacks {', '.join(lacking)}; it has {there}. See docs/benchmark.md")
                 read = {key: _array(path, key, file) for key in KEYS}
-        except DAMAGED as error:
+        except (OSError, *DAMAGED) as error:
             raise ValueError(f"{path}: not a readable npz ({error}); write it with numpy.savez") from error
         names = tuple(map(str, np.atleast_1d(read["scenes"])))
         _require_facts(path, read, benchmark)
