@@ -18,6 +18,7 @@ def main(fbx: str, glb: str) -> None:
     blender: Any = bpy
     blender.ops.wm.read_factory_settings(use_empty=True)
     blender.ops.import_scene.fbx(filepath=fbx)  # sets the frame rate, too
+    blender.context.scene.render.fps_base = 1.0  # by which Blender's glTF multiplies where it should divide
     blender.ops.export_scene.gltf(
         filepath=glb,
         export_format="GLB",

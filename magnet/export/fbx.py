@@ -49,15 +49,20 @@ def save_fbx(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = Bo
     blender()
     path = suffixed(path, ".fbx")
     with tempfile.TemporaryDirectory() as folder:
-        as_fbx(save_glb(scene, Path(folder) / "scene.glb", body, bones), path, scene.fps)
+        as_fbx(save_glb(at_whole_rate(scene), Path(folder) / "scene.glb", body, bones), path, scene.fps)
     return path
 
 
+def at_whole_rate(scene: Scene) -> Scene:
+    """The same frames at a whole number of them a second, as Blender counts time."""
+    return scene.replace(fps=float(max(round(scene.fps), 1)))
+
+
 def as_fbx(glb: Path, path: Path, fps: float) -> None:
-    """Write a GLB as FBX, with a keyframe for every frame."""
+    """Write a GLB of a scene `at_whole_rate` as FBX of its own rate, with a keyframe for every frame."""
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "scene.fbx"
-        run_script(AS_FBX, glb, made, f"write {path}", f"{fps:g}")
+        run_script(AS_FBX, glb, made, f"write {path}", f"{fps:.12g}")
         with whole(path) as part:
             shutil.copyfile(made, part)
 

@@ -15,7 +15,7 @@ from magnet.body import Body
 from magnet.body.joints import ANKLES, COLLARS, HIPS, KNEES
 from magnet.export.bvh import bvh_text, depth_first, euler_zxy, paths_of
 from magnet.export.bvh_read import bvh_lines, read_bvh
-from magnet.export.fbx import as_fbx, converted
+from magnet.export.fbx import as_fbx, at_whole_rate, converted
 from magnet.export.glb import FLOAT, Gltf, animation, frame_times, standing, unbroken
 from magnet.export.glb_read import GlbRig, in_one_line, read_rig
 from magnet.export.gltf_file import matrices
@@ -239,7 +239,7 @@ def _onto_fbx(scene: Scene, path: Path, body: Body, rig: Path, options: RigOptio
     with tempfile.TemporaryDirectory() as folder:
         glb, made = converted(rig, Path(folder) / "rig.glb"), Path(folder) / "moved.glb"
         try:
-            _onto_glb(scene, made, body, glb, options)
+            _onto_glb(at_whole_rate(scene), made, body, glb, options)
         except ValueError as error:
             raise ValueError(str(error).replace(str(glb), str(rig))) from error
         as_fbx(made, path, scene.fps)

@@ -16,6 +16,7 @@ from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_bvh, save_glb
 from magnet.export.fbx import save_fbx
 from magnet.export.reading import read
+from magnet.motion.resample import resampled
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 
@@ -65,6 +66,41 @@ def test_a_glb_and_an_fbx_hold_the_bodys_joints_and_skin(blender, duo, body: Bod
     away = np.abs(joints(again) - truth).max()
     report("FBX joints", again, away)
     assert away < 0.05 * MILLIMETRE
+
+
+AN_FBX = """
+import json, sys, bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.fbx(filepath=sys.argv[1])
+render = bpy.context.scene.render
+held = {
+    "meshes": sorted(each.name for each in bpy.data.objects if each.type == "MESH"),
+    "takes": sorted(action.name for action in bpy.data.actions),
+    "seconds": max(action.frame_range[1] - action.frame_range[0] for action in bpy.data.actions) / render.fps,
+    "fps": render.fps / render.fps_base,
+}
+open(sys.argv[2], "w").write(json.dumps(held))
+"""
+
+
+@pytest.mark.parametrize("fps", [30.0, 29.97, 12.5])
+def test_an_fbx_holds_the_people_alone_in_one_take_of_their_rate(
+    blender: str, duo: Scene, fps: float, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAGNET_BLENDER", blender)
+    path = save_fbx(duo.replace(fps=fps), tmp_path / "duo.fbx", body)
+    subprocess.run([blender, "-c", AN_FBX, str(path), str(tmp_path / "held.json")], check=True, capture_output=True)
+    held = json.loads((tmp_path / "held.json").read_text())
+    assert held["meshes"] == ["person_0_body", "person_1_body"]
+    assert held["takes"] == ["person_0|motion", "person_1|motion"]
+    assert held["fps"] == pytest.approx(fps, rel=1e-5)
+    # Blender's importer counts keys by the rate before it is broken.
+    assert held["seconds"] == pytest.approx((duo.frames - 1) / fps, rel=1e-4)
+    got = read(path).scene
+    assert (got.frames - 1) / got.fps == pytest.approx((duo.frames - 1) / fps, abs=1 / got.fps)
+    again = resampled(got, fps / 4)  # an FBX is read at whole rates, with poses between its keys
+    away = body.joints(again)[:, :3] - body.joints(duo.frames_at(torch.arange(0, 12, 4)))
+    assert got.agents == 2 and float(away.norm(dim=-1).max()) < 30 * MILLIMETRE
 
 
 TO_BLENDER_AND_BACK = """
