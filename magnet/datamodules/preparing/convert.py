@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -356,10 +356,8 @@ def _converted(
     pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job,))
     try:
         running = {pool.submit(work, take, file(take)): take for take in takes}
-        while running:
-            ready, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in ready:
-                yield running.pop(future), future.result()
+        for future in as_completed(running):  # looks at each once; `wait` looks at all that run, each time
+            yield running.pop(future), future.result()
     except BrokenProcessPool as error:
         raise OSError(
             "a worker process died, perhaps for want of memory: run the same command again with fewer --workers; "

@@ -7,19 +7,24 @@ import json
 import multiprocessing
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from magnet import cli, files
+from magnet.datamodules.preparing import convert
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.check import check_store
 from magnet.datamodules.preparing.convert import PrepareJob
 from magnet.datamodules.preparing.prepare import prepare
+from magnet.datamodules.reading.recording import Take
 from magnet.datamodules.store.reader import MANIFEST, STATE, StoreReader
 from tests.cases import few, some_slow
 from tests.datamodules import made
@@ -277,3 +282,42 @@ def test_a_stores_manifest_does_not_lead_out_of_it(order: PrepareJob, tmp_path: 
                 StoreReader(out).files()
             with pytest.raises(ValueError, match="its index names"):
                 StoreReader(out).clips("train")
+
+
+# -- many takes --------------------------------------------------------------------------------
+
+
+def calls_for(count: int, job: PrepareJob, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Functions that are called while so many takes are done, each after the one before it was looked at."""
+    begun: list[Future[str]] = []
+
+    class Work(Future[str]):
+        def result(self, timeout: float | None = None) -> str:
+            if begun:
+                begun.pop().set_result("done")
+            return super().result(timeout)
+
+    def submit(convert_one: object, take: Take, path: None) -> Future[str]:
+        work = Work()
+        if take is takes[0]:
+            work.set_result("done")
+        else:
+            begun.append(work)
+        return work
+
+    pool = SimpleNamespace(submit=submit, shutdown=lambda **_: None)
+    monkeypatch.setattr(convert, "ProcessPoolExecutor", lambda *_, **__: pool)
+    takes = [Take(f"take {number}", (), "train") for number in range(count)]
+    calls: list[str] = []
+    sys.setprofile(lambda frame, event, value: calls.append(event))
+    try:
+        assert sum(1 for _ in convert.convert_all(job, takes, lambda take: None, workers=2)) == count
+    finally:
+        sys.setprofile(None)
+    return len(calls)
+
+
+def test_twice_as_many_takes_are_twice_the_work_for_the_process_that_waits(
+    order: PrepareJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert calls_for(160, order, monkeypatch) < 2.5 * calls_for(80, order, monkeypatch)
