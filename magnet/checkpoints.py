@@ -350,13 +350,14 @@ def _in_parts(state: dict[str, Tensor], half: bool) -> list[dict[str, Tensor]]:
 
 REQUEUED = "hpc_ckpt_"
 """How the checkpoints begin that Lightning leaves for a job that SLURM starts again; a number follows."""
-NUMBERED = re.compile(rf"{REQUEUED}(\d+)\.ckpt")
 
 
 def requeued(folder: Path) -> Path | None:
-    """The checkpoint with which a job goes on that SLURM has started again; None: it has not, or there is none."""
+    """The checkpoint with which a job goes on that SLURM has started again; None: it has not, or there is none.
+
+    The newest of those that Lightning left when time was up, and the last one of a job that was ended otherwise.
+    """
     if not int(os.environ.get("SLURM_RESTART_COUNT") or 0):
         return None
-    names = {path: NUMBERED.fullmatch(path.name) for path in folder.glob(f"{REQUEUED}*")}
-    found = {int(match[1]): path for path, match in names.items() if match}
-    return found[max(found)] if found else None
+    found = [*folder.glob(f"{REQUEUED}*.ckpt"), *folder.glob("checkpoints/last.ckpt")]
+    return max(found, key=lambda path: path.stat().st_mtime, default=None)

@@ -1,4 +1,4 @@
-"""Ctrl+C or SIGTERM in a training: the first one ends it after the step that it is in, in all of its processes."""
+"""Ctrl+C, SIGTERM or SLURM's signal in a training: what it asks for is done after the step, by all processes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 import torch
+from lightning.fabric.plugins.environments import SLURMEnvironment
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from magnet.cli.run_folder import LastCheckpoint
@@ -33,11 +34,14 @@ class EndOfStep(Callback):
     A validation that is due after the step, or runs, is finished, too: a training that goes on would not repeat it.
     Whoever says SIGTERM may not wait for it, so that a checkpoint is written first; a second SIGTERM cuts it short.
     Of several processes any may be told, each in another step: after each step they agree, and end after the same one.
+    SLURM's signal that time is up waits for the end of the step, too: Lightning's answer to it, a checkpoint and the
+    request to be started again, would lose the batch, and several processes in a step would wait for each other.
     """
 
     def __init__(self) -> None:
         self.asked = 0  # the signal that this process has got
         self.agreed = 0  # the signal that all know of
+        self.time_is_up = 0  # SLURM's signal, which Lightning has not answered yet
         self.since = 0.0
         self.before: dict[int, Any] = {}
         self.steps = self.said = False
@@ -63,10 +67,17 @@ class EndOfStep(Callback):
             self.since = time.monotonic()
             self._say(trainer, number)
 
-        for number in CODES:
+        handlers: dict[int, Any] = dict.fromkeys(CODES, ask)
+        slurm = trainer._accelerator_connector.cluster_environment
+        if isinstance(slurm, SLURMEnvironment) and slurm.auto_requeue and slurm.requeue_signal:
+            handlers[slurm.requeue_signal] = self._later
+        for number, handler in handlers.items():
             if callable(before := signal.getsignal(number)):
                 self.before[number] = before
-                signal.signal(number, ask)
+                signal.signal(number, handler)
+
+    def _later(self, number: int, frame: FrameType | None) -> None:
+        self.time_is_up = number
 
     def _say(self, trainer: Trainer, number: int) -> None:
         """Tell once what happens now to whoever has pressed Ctrl+C."""
@@ -88,11 +99,14 @@ class EndOfStep(Callback):
 
     def _agree(self, trainer: Trainer) -> None:
         """Hear what any of the processes was told; the training ends where one was."""
-        told = self.asked
+        told, up = self.asked, self.time_is_up
         if trainer.world_size > 1:
-            any_told = torch.tensor(told, device=trainer.strategy.root_device)
+            any_told = torch.tensor([told, up], device=trainer.strategy.root_device)
             torch.distributed.all_reduce(any_told, torch.distributed.ReduceOp.MAX)
-            told = int(any_told)
+            told, up = any_told.tolist()
+        if up:
+            self.time_is_up = 0
+            self.before[up](up, None)
         self.agreed = told
         if told:
             self._say(trainer, told)

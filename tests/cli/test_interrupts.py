@@ -257,3 +257,30 @@ def test_several_processes_of_which_any_is_told_end_after_one_step_and_go_on_as_
     said = (several / f"{name}.0.log").read_text()
     assert said.count("stopping after this step") == (code == 130) and "goes on" in said
     assert "stopping" not in (several / f"{name}.1.log").read_text()
+
+
+SLURM = {"NTASKS": "1", "PROCID": "0", "LOCALID": "0", "NODEID": "0", "JOB_ID": "7", "JOB_NAME": "big"}
+"""What SLURM tells a job of one process, behind SLURM_."""
+
+
+@pytest.mark.parametrize("accumulated", [1, 3])
+@pytest.mark.parametrize("batch", [0, 1, 2])
+def test_a_job_whose_time_is_up_goes_on_as_if_it_had_not_been(
+    batch: int, accumulated: int, toy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SLURM's signal has Lightning write a checkpoint, and ask that the job is started again."""
+    rates = ("--trainer.max_epochs", "1", "--trainer.accumulate_grad_batches", str(accumulated))
+    words = (*FIT, *HOW, *CPU, *rates)
+    assert cli.main([*words, "--out", "whole"]) == 0
+    (toy / "scontrol").write_text("#!/bin/sh\n")
+    (toy / "scontrol").chmod(0o755)
+    for name, value in {**{f"SLURM_{name}": value for name, value in SLURM.items()}, "PATH": f"{toy}:/bin"}.items():
+        monkeypatch.setenv(name, value)
+    seen = tell(monkeypatch, signal.SIGUSR1, batch)
+    assert cli.main([*words, "--out", "told"]) == 0
+    (toy / "on").mkdir()
+    shutil.copy("told/hpc_ckpt_1.ckpt", "on")
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert cli.main([*words, "--out", "on"]) == 0
+    assert seen == [*range(6), *range((batch // accumulated + 1) * accumulated, 6)]
+    assert torch.equal(weights("on"), weights("whole"))

@@ -39,6 +39,25 @@ def test_a_fit_goes_on_with_its_own_last_run_and_a_test_takes_anybodys(tmp_path:
         which_checkpoint("fit", last, tmp_path, "third")
 
 
+def test_a_job_that_slurm_starts_again_goes_on_with_the_newest_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that was put off for another, or whose node failed, has none that Lightning leaves when time is up."""
+    given, run = Arguments.split(["--out", str(tmp_path / "run")]), tmp_path / "run"
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert which_checkpoint("fit", given, tmp_path, "run") is None
+    last = finished(tmp_path, "run")
+    assert which_checkpoint("fit", given, tmp_path, "run") == last
+    (left := run / "hpc_ckpt_1.ckpt").touch()
+    older(last)
+    assert which_checkpoint("fit", given, tmp_path, "run") == left
+    older(left)
+    last.touch()
+    assert which_checkpoint("fit", given, tmp_path, "run") == last
+    monkeypatch.delenv("SLURM_RESTART_COUNT")
+    assert which_checkpoint("fit", given, tmp_path, "run") is None
+
+
 def test_where_no_run_has_the_checkpoint_those_that_are_there_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
