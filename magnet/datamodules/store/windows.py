@@ -246,6 +246,14 @@ def recorded_windows(store: MemoryStore, pairs: Sequence[tuple[int, int]]) -> Wi
     )
 
 
+def pairs_of_each(clips: Ints, people: Ints, size: int) -> Ints:
+    """How many others each window can make up `size` people with: windows of another clip, with enough people. (n,)"""
+    lacking = size - people
+    enough = (people >= np.arange(size + 1)[:, None]).sum(axis=1)  # windows of so many people or more
+    found = enough[np.maximum(lacking, 0)] - np.where(people >= lacking, np.bincount(clips)[clips], 0)
+    return np.where(lacking > 0, found, 0)
+
+
 def composed_windows(
     store: MemoryStore, plain: WindowIndex, count: int, apart: tuple[float, float], seed: int
 ) -> WindowIndex:
@@ -256,27 +264,24 @@ def composed_windows(
     Raises:
         ValueError: the clips or slots do not allow such scenes.
     """
-    people = store.people[plain.clips[:, 0]]
-    sizes = [size for size in (3, 4) if size <= store.max_agents]
-    pairs: dict[int, list[tuple[int, int]]] = {}
-    for size in sizes:
-        pairs[size] = [
-            (i, j)
-            for i in range(len(plain))
-            for j in range(len(plain))
-            if plain.clips[i, 0] != plain.clips[j, 0] and people[i] < size <= people[i] + people[j]
-        ]
-    sizes = [size for size in sizes if pairs[size]]
+    clips = plain.clips[:, 0]
+    people = store.people[clips]
+    pairs = {size: pairs_of_each(clips, people, size) for size in (3, 4) if size <= store.max_agents}
+    sizes = [size for size, each in pairs.items() if each.any()]
     if not sizes:
         raise ValueError(
             f"test.composed={count}: needs max_agents of 3 or more (got {store.max_agents}) and test windows of two"
-            f" clips that make up three people (got {len(plain)} windows of {len(set(plain.clips[:, 0]))} clips)"
+            f" clips that make up three people (got {len(plain)} windows of {len(set(clips))} clips)"
         )
     u = uniforms(seed, 0, 0, count, 5)
     rows = []
     for k in range(count):
-        options = pairs[sizes[k % len(sizes)]]
-        rows.append(options[int(u[k, 0] * len(options))])
+        size = sizes[k % len(sizes)]
+        ends = np.cumsum(pairs[size])
+        pick = int(u[k, 0] * ends[-1])
+        i = int(np.searchsorted(ends, pick, side="right"))
+        others = np.flatnonzero((clips != clips[i]) & (people >= size - people[i]))
+        rows.append((i, others[pick - ends[i] + len(others)]))
     first, second = np.array(rows, dtype=np.int64).T
     wanted = np.array([sizes[k % len(sizes)] for k in range(count)], dtype=np.int64)
     turn = (u[:, 1] * people[second]).astype(np.int64)

@@ -1,14 +1,18 @@
 """Laws of composed scenes: two groups on one floor that keep apart and stay what they were."""
 
+import itertools
 import math
 import re
+import tracemalloc
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from magnet.datamodules.options import Augmentation, HeldOutScenes
-from magnet.datamodules.store.memory import place_apart
+from magnet.datamodules.store.memory import MemoryStore, place_apart
+from magnet.datamodules.store.windows import composed_windows, fixed_windows, uniforms
 from magnet.motion.frames import inverse
 from magnet.motion.scene import Scene, concatenate
 from magnet.testing import random_scene
@@ -126,3 +130,36 @@ def test_composing_one_clip_with_itself_is_refused() -> None:
     data = FakeData([random_clip("a", 400, split="test")], max_agents=4, test=HeldOutScenes(composed=2))
     with pytest.raises(ValueError, match=r"test\.composed=2: needs max_agents of 3 or more"):
         data.test_dataloader()
+
+
+@pytest.fixture
+def crowd() -> MemoryStore:
+    """Six clips of one, two and three people."""
+    clips = [random_clip(name, 416, 1 + k % 3, split="test") for k, name in enumerate("abcdef")]
+    return FakeData(clips, max_agents=4).store("test")
+
+
+def test_every_pair_that_makes_up_enough_people_is_equally_likely(crowd: MemoryStore) -> None:
+    plain = fixed_windows(crowd, 64, 64)
+    clips, people = plain.clips[:, 0], crowd.people[plain.clips[:, 0]]
+    draws = uniforms(7, 0, 0, 400, 5)[:, 0]
+    composed = composed_windows(crowd, plain, 400, (1.6, 3.5), 7)
+    for size in (3, 4):
+        pairs = [
+            (i, j)
+            for i, j in itertools.product(range(len(plain)), repeat=2)
+            if clips[i] != clips[j] and people[i] < size <= people[i] + people[j]
+        ]
+        mine = np.arange(400) % 2 == size - 3
+        i, j = np.array([pairs[int(u * len(pairs))] for u in draws[mine]]).T
+        assert np.array_equal(composed.clips[mine], np.stack([clips[i], clips[j]], axis=1))
+        assert np.array_equal(composed.starts[mine], np.stack([plain.starts[i, 0], plain.starts[j, 0]], axis=1))
+
+
+def test_composing_many_windows_needs_no_list_of_all_pairs(crowd: MemoryStore) -> None:
+    plain = fixed_windows(crowd, 16, 1)
+    tracemalloc.start()
+    composed_windows(crowd, plain, 8, (1.6, 3.5), 7)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < len(plain) ** 2
