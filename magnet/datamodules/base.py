@@ -223,6 +223,7 @@ class MotionDataModule(LightningDataModule):
             *place,
             shared=draws.shared,
             ahead=self.read_ahead if placed.on_disk else 0,
+            overfit=0 if self.trainer is None else self.trainer.overfit_batches,  # type: ignore[attr-defined]
         )
         if self._resume:
             self._train_loader.load_state_dict(self._resume)

@@ -59,6 +59,7 @@ class FakeTrainer:
 
     global_rank: int = 0
     world_size: int = 1
+    overfit_batches: float = 0
     strategy: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(root_device=torch.device("cpu")))
 
 

@@ -86,6 +86,8 @@ class TrainLoader:
         world: number of processes.
         shared: `draw` numbers the samples of this process alone.
         ahead: batches fetched ahead; 0: none. They do not count as seen in the state.
+        overfit: so many batches, or such a share of an epoch's, are yielded again and again, as the Trainer's
+            `overfit_batches` asks; 0: every batch is new.
     """
 
     def __init__(
@@ -99,11 +101,13 @@ class TrainLoader:
         world: int = 1,
         shared: bool = False,
         ahead: int = 0,
+        overfit: float = 0,
     ) -> None:
         self.draw, self.fetch, self.finish, self.shared = draw, fetch, finish, shared
         self.ahead = Prefetcher(self._fetched, self._after, ahead) if ahead else None
         self.batch_size, self.rank, self.world = batch_size, rank, world
         self.batches = max(1, epoch_size // (batch_size * world))
+        self.again = max(1, int(overfit * self.batches if isinstance(overfit, float) else overfit)) if overfit else 0
         self.epoch, self.batch = 0, 0
 
     def __len__(self) -> int:
@@ -121,6 +125,8 @@ class TrainLoader:
 
     def _fetched(self, cursor: Cursor) -> Any:
         epoch, batch = cursor
+        if self.again:
+            epoch, batch = 0, (epoch * self.batches + batch) % self.again
         block = batch if self.shared else batch * self.world + self.rank
         return self.fetch(self.draw(epoch, block * self.batch_size, self.batch_size))
 

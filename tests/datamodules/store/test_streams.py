@@ -85,6 +85,16 @@ def test_training_interrupted_by_a_checkpoint_sees_what_it_would_have_seen(
     assert torch.equal(resumed.weight, whole.weight)
 
 
+@pytest.mark.filterwarnings("ignore:training goes without validation")
+@pytest.mark.parametrize(("overfit", "batches"), [(1, 1), (3, 3), (0.5, 2)])
+def test_overfitting_is_shown_the_same_batches_again_and_again(overfit: float, batches: int, tmp_path: Path) -> None:
+    """Of four batches an epoch."""
+    model, data = Recorder(), FakeData(couples_and_singles())
+    quiet(tmp_path, enable_checkpointing=False, max_steps=3 * batches, overfit_batches=overfit).fit(model, data)
+    assert len(set(model.seen)) == batches
+    assert model.seen == model.seen[:batches] * 3
+
+
 @pytest.mark.parametrize(("first", "then", "limit"), [(2, 4, "max_epochs"), (6, 11, "max_steps")])
 def test_a_second_fit_of_a_trainer_goes_on_and_another_trainers_begins_anew(
     tmp_path: Path, first: int, then: int, limit: str
