@@ -52,10 +52,12 @@ def explain(error: Exception) -> str | None:
         )
     if isinstance(error, RuntimeError) and "--ntasks-per-node" in text:  # Lightning's, of SLURM
         return f"{text} Or start one process alone, by srun --ntasks=1."
+    if isinstance(error, RuntimeError) and text.startswith("Early stopping conditioned on metric"):  # Lightning's
+        return f"{text} (--debug shows where)"
     if isinstance(error, MemoryError) or re.search(SHORT, text):
         return (
             "this takes more memory than there is: ask for less at a time, such as a smaller --data.batch_size or "
-            "model, fewer --samples, people or frames (--debug shows where)"
+            "model, fewer --samples, people or frames, in a test a larger --baseline_stride (--debug shows where)"
         )
     if isinstance(error, KeyError) and "Trying to restore optimizer state" in text:  # Lightning's
         return weights_alone()

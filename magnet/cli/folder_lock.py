@@ -33,6 +33,8 @@ def held(folder: Path) -> Iterator[None]:
             try:
                 lock.enter_context(alone(folder / LOCK, ""))
                 lock.callback(_remove, folder / LOCK)
+                for half in (folder / "checkpoints").glob(".new-*"):  # of a process that was killed as it wrote
+                    half.unlink()
             except Taken as error:
                 lock.pop_all()
                 raise CommandError(

@@ -121,3 +121,11 @@ def test_a_training_that_was_there_before_goes_on_with_a_checkpoint_that_is_ther
         (place / name).touch()
     assert cli.main(FIT) == 2
     assert capsys.readouterr().err.splitlines()[-1].endswith(f"two holds a training run already: {advice}")
+
+
+def test_half_a_checkpoint_of_a_killed_training_is_gone_once_it_goes_on(toy: Path) -> None:
+    assert cli.main(FIT) == 0
+    half = toy / "two" / "checkpoints" / ".new-half"
+    half.touch()
+    assert cli.main([*FIT, "--trainer.max_steps", "2", "--ckpt_path", "last"]) == 0
+    assert not half.exists()

@@ -101,6 +101,13 @@ def test_memory_that_does_not_suffice_is_told_in_a_line() -> None:
         assert "more memory than there is: ask for less at a time" in (explain(error) or "")
 
 
+def test_what_early_stopping_watches_in_vain_is_told_in_a_line(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stop = "[{class_path: EarlyStopping, init_args: {monitor: val_loss}}]"
+    words = ("fit", "--model", "ToyModel", "--data", "ToyData", "--trainer.accelerator", "cpu", "--out", "run")
+    assert cli.main([*words, "--trainer.max_epochs", "1", "--trainer.callbacks", stop]) == 2
+    assert "metric `val_loss` which is not available" in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_only_numbers_that_nothing_takes_are_too_large() -> None:
     assert too_large(["--seed", str(2**63 - 1), "--seed=-9223372036854775807", "--title", "9e99"]) is None
     said = f"--seed {2**63}: too large, expected at most {2**63 - 1}"
