@@ -7,9 +7,11 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
@@ -72,6 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, 2 where the user can put it right, or 141 where its output was closed before the end.
     """
     take_any_letter(sys.stdout, sys.stderr)
+    if arguments is None and not wants_traces(sys.argv[1:]):  # of a process that is nobody else's
+        warnings.showwarning = warn_in_a_line
     try:
         code = answered(arguments)
         print(end="", flush=True)  # here, for what fails once Python ends is told with a traceback
@@ -85,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def answered(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, and say in a line what the user can put right. Returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
+    debug = wants_traces(arguments)
     arguments = [underscored(argument) for argument in arguments if argument != "--debug"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage(), end="")
@@ -184,6 +188,16 @@ def usage() -> str:
     """What `magnet --help` says."""
     width = max(map(len, COMMANDS))
     return USAGE.format(commands="\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()))
+
+
+def wants_traces(arguments: Sequence[str]) -> bool:
+    """Whether errors and warnings are to say where in the code they come from."""
+    return bool(os.environ.get("MAGNET_DEBUG", "")) or "--debug" in arguments
+
+
+def warn_in_a_line(message: Warning | str, *_: Any, **__: Any) -> None:
+    """What Python calls to show a warning: as an error is, without the line of code that it came from."""
+    print(f"magnet: warning: {message}", file=sys.stderr)
 
 
 def complain(command: str, message: str, code: int = 2) -> int:

@@ -20,6 +20,7 @@ from magnet.cli import data, export, refine, report
 from magnet.cli.errors import CommandError
 from magnet.cli.main import COMMANDS, TRAINER_COMMANDS, underscored, usage
 from magnet.datamodules import registry
+from magnet.testing import random_scene
 from tests import toys
 from tests.cases import few, some_slow
 
@@ -106,6 +107,16 @@ def test_python_m_magnet_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "magnet", "tset"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert "did you mean test?" in done.stderr
+
+
+def test_a_warning_is_a_line_without_the_code_that_it_came_from(tmp_path: Path) -> None:
+    scene = random_scene(1, 8, 2, torch.Generator().manual_seed(0))
+    scene.replace(valid=torch.arange(8)[None] != 3).save(tmp_path / "lost.npz")
+    words = [sys.executable, "-m", "magnet", "export", str(tmp_path / "lost.npz"), str(tmp_path / "lost.glb")]
+    for debug in (False, True):
+        done = subprocess.run(words + ["--debug"] * debug, capture_output=True, text=True, timeout=120, check=True)
+        assert ("UserWarning" in done.stderr) == debug
+        assert done.stderr.startswith("magnet: warning: lost.glb: 1 of 8 frames, frame 3 first") != debug
 
 
 def test_tasks_are_listed_with_what_they_sample(capsys: pytest.CaptureFixture[str]) -> None:
