@@ -131,7 +131,7 @@ class TokenModelCore(nn.Module):
         stored = checkpoint["tokenizer_hyper_parameters"]
         given = dict(self.tokenizer.hparams) if self.built and isinstance(self.tokenizer, TokenizerCore) else None
         if not self.built or stored != given:
-            self.build(RawPose() if stored is None else TokenizerCore(**stored))
+            self.build(RawPose() if stored is None else tokenizer_of(stored))
             self.to(self.device)
 
     @classmethod
@@ -235,6 +235,14 @@ def each_slot(scene: Scene) -> Scene:
         body=scene.body,
         valid=None if scene.valid is None else scene.valid.repeat_interleave(P, dim=0),
     )
+
+
+def tokenizer_of(options: dict[str, Any]) -> TokenizerCore:
+    """The tokenizer that a checkpoint says its model was trained with, without its weights."""
+    try:
+        return TokenizerCore(**options)
+    except TypeError as error:
+        raise ValueError(f"its tokenizer is of a later version than this one, or damaged: {error}") from error
 
 
 def taken_by(kind: type) -> set[str]:

@@ -37,6 +37,13 @@ def test_a_loaded_model_holds_all_that_training_and_saving_need(model):
     assert all(weight.requires_grad for weight in model.transformer.parameters())
 
 
+def test_a_tokenizer_with_an_option_of_a_later_version_is_refused():
+    checkpoint = checkpoints.read(checkpoints.resolve())
+    later = {**checkpoint, "tokenizer_hyper_parameters": {**checkpoint["tokenizer_hyper_parameters"], "later": 1}}
+    with pytest.raises(ValueError, match=r"its tokenizer is of a later version than this one, or damaged: .*'later'"):
+        Denoiser.load().on_load_checkpoint(later)
+
+
 def test_it_says_what_it_was_trained_on_and_names_no_machine():
     text = (checkpoints.resolve() / "config.json").read_text()
     config = json.loads(text)
