@@ -296,29 +296,36 @@ class MotionDataModule(LightningDataModule):
         composed = composed_windows(store, plain, count, self.augment.compose_apart, self.seed)
         return WindowIndex.concatenate([windows, composed])
 
-    def train_scenes(self, frames: int, stride: int = 30, composed: int = 0) -> Scene:
+    def train_scenes(self, frames: int, stride: int = 30, composed: int = 0, most: int | None = None) -> Scene:
         """Valid training windows of `frames` frames, `stride` apart, and `composed` scenes made of two of them each.
+
+        Args:
+            most: of more windows so many, evenly spread; None: all.
 
         Raises:
             ValueError: no clip is long enough.
         """
         return self.store("train").gather(
-            self._train_index(frames, stride, composed), frames, self.augment.compose_clearance
+            self._train_index(frames, stride, composed, most), frames, self.augment.compose_clearance
         )
 
-    def train_windows(self, frames: int, stride: int = 30, composed: int = 0, chunk: int = 64) -> Iterator[Scene]:
+    def train_windows(
+        self, frames: int, stride: int = 30, composed: int = 0, most: int | None = None, chunk: int = 64
+    ) -> Iterator[Scene]:
         """The same as `train_scenes`, in batches of at most `chunk` scenes.
 
         Raises:
             ValueError: no clip is long enough.
         """
-        store, windows = self.store("train"), self._train_index(frames, stride, composed)
+        store, windows = self.store("train"), self._train_index(frames, stride, composed, most)
         for first in range(0, len(windows), chunk):
             yield store.gather(windows[first : first + chunk], frames, self.augment.compose_clearance)
 
-    def _train_index(self, frames: int, stride: int, composed: int) -> WindowIndex:
+    def _train_index(self, frames: int, stride: int, composed: int, most: int | None) -> WindowIndex:
         store = self.store("train")
         windows = self._some("train", fixed_windows(store, frames, stride), frames)
+        if most is not None and len(windows) > most:
+            windows = windows[np.linspace(0, len(windows) - 1, most).round().astype(np.int64)]
         return self._with_composed(store, windows, windows, composed)
 
     # -- Lightning -----------------------------------------------------------------------------

@@ -62,7 +62,8 @@ class Evaluator(L.LightningModule):
             found, a ridge regression, training windows in place of samples, and how near samples come to these.
         seed: all noise follows from it. A sample's is its own, whatever else is in the batch, so that scores do not
             depend on the batch size.
-        baseline_stride: frames between the starts of training stretches that baselines choose from.
+        baseline_stride: frames between the starts of training stretches that baselines choose from; of over 3,000
+            stretches as many are taken, evenly spread.
         interval: what confidence intervals take as independent: `take`, recordings; `scene`, runs of test scenes of
             which none overlaps the first of another; `auto`, recordings where there are five or more, else runs.
 

@@ -18,6 +18,7 @@ from magnet.baselines.windows import moved_points
 from magnet.body import Body
 from magnet.datamodules.base import MotionDataModule
 from magnet.datamodules.store.memory import WindowIndex
+from magnet.errors import warn_user
 from magnet.evaluation.by_scene import in_each_scene, of_all_processes, scene_values
 from magnet.evaluation.results import Results
 from magnet.metrics import Beside, NearestTraining, all_metrics, beside, columns_of, ground_truth_metrics
@@ -74,12 +75,16 @@ CONFIDENCE = 0.95
 BASELINE_COMPOSED = 500
 """Composed training stretches that baselines choose from where test scenes are composed too."""
 
+MOST_STRETCHES = 3000
+"""Training stretches that are held in memory at most, and windows: of many hours they would fill any. Of CMU there are
+1,225."""
+
 WINDOW_STRIDE = 5
 """Frames between the training windows that the regression is fitted to and the nearest one is looked for among."""
 
 ENOUGH_WINDOWS = 1500
 """About so many of them are enough, mirror images not counted: with more data their stride grows, though to
-`baseline_stride` at most, so that of much data there are more."""
+`baseline_stride` at most, so that of much data there are more, `MOST_STRETCHES` at most."""
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""
@@ -125,7 +130,8 @@ class Scoring:
         samples: futures of each scene that a method is asked for.
         baselines: also measure baselines, training windows in place of samples, and how near methods come to these.
         seed: all randomness of methods follows from it.
-        baseline_stride: frames between the starts of training stretches that baselines choose from.
+        baseline_stride: frames between the starts of training stretches that baselines choose from; of over 3,000
+            stretches as many are taken, evenly spread, and a warning says so.
         interval: what confidence intervals take as independent; see `independent_units`.
         device: where joints are measured.
 
@@ -205,14 +211,16 @@ class Scoring:
         frames = self.context + self.horizon
         stride = max(WINDOW_STRIDE, int(datamodule.store("train").length.sum()) // ENOUGH_WINDOWS)
         composed = BASELINE_COMPOSED if datamodule.test.composed else 0
-        scenes = datamodule.train_windows(frames, min(stride, self.baseline_stride), composed)
+        scenes = datamodule.train_windows(frames, min(stride, self.baseline_stride), composed, MOST_STRETCHES)
         mirror = datamodule.augment.mirror
         return Windows.of((scene.to(self.device) for scene in scenes), self.body, self.context, mirror)
 
     def _baselines(self, datamodule: MotionDataModule, windows: Windows) -> dict[str, Predictor]:
         frames = self.context + self.horizon
         composed = BASELINE_COMPOSED if datamodule.test.composed else 0
-        train = datamodule.train_scenes(frames, self.baseline_stride, composed).to(self.device)
+        train = datamodule.train_scenes(frames, self.baseline_stride, composed, MOST_STRETCHES).to(self.device)
+        if train.scenes >= MOST_STRETCHES + composed:
+            warn_user(f"baselines choose from {MOST_STRETCHES:,} training stretches, evenly spread, not from all")
 
         def of_scenes(method: Callable[..., Scene], draws: bool = False) -> Predictor:
             return SceneBaseline(method, self.body, self.context, self.horizon, draws)

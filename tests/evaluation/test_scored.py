@@ -210,6 +210,16 @@ def test_training_windows_that_are_the_test_scenes_are_at_no_distance_from_them(
     assert row["jitter"] == pytest.approx(ran.results.rows["ground truth"]["jitter"], rel=1e-4)
 
 
+def test_of_much_data_baselines_choose_from_stretches_evenly_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = CONTEXT + HORIZON
+    clips = [random_clip("long", frames + 160, 2, split="train"), random_clip("test", 2 * frames, 2, split="test")]
+    wide = run(data(clips), task=JointFuture(), baseline_stride=40).results.rows
+    monkeypatch.setattr("magnet.evaluation.scoring.MOST_STRETCHES", 5)
+    with pytest.warns(UserWarning, match="baselines choose from 5 training stretches, evenly spread, not from all"):
+        few = run(data(clips), task=JointFuture(), baseline_stride=20).results.rows  # of nine the first is every other
+    assert few["NN"] == pytest.approx(wide["NN"]) and few["RS"] == pytest.approx(wide["RS"])
+
+
 @pytest.mark.parametrize(("interval", "units"), [("scene", 9), ("take", 3), ("auto", 9)])
 def test_scenes_that_overlap_are_one_unit(interval: str, units: int) -> None:
     """Three recordings of 120 frames hold three scenes of 36 frames each side by side, however densely they begin."""
