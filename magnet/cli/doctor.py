@@ -38,7 +38,7 @@ class Extra:
 EXTRAS = {
     "view": Extra(("viser",), "magnet view: scenes in the browser, and a model that plays live"),
     "video": Extra(("av",), ".mp4 films; .gif and .webp need nothing"),
-    "tensorboard": Extra(("tensorboard",), "curves of training in TensorBoard; without it, in a csv"),
+    "tensorboard": Extra(("tensorboard",), "curves of training in TensorBoard, beside those in a csv"),
     "wandb": Extra(("wandb",), "magnet fit --wandb: curves of training at Weights & Biases"),
     "smplx": Extra(("smplx",), "comparing with the package smplx, non-commercial; SMPL-X files are read without it"),
     "hub": Extra(("huggingface_hub",), 'models of a hub: magnet.load("hub:owner/name")'),
