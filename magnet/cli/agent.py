@@ -74,7 +74,8 @@ def main(arguments: Sequence[str] = ()) -> int:
     if given.make_keys:
         if given.keys is None:
             raise CommandError("--make_keys writes into a folder: name it with --keys FOLDER")
-        print(f"written: {zeromq.make_keys(given.keys, given.name)}")
+        secret = zeromq.make_keys(given.keys, given.name)
+        print(f"written: {secret.with_suffix('.key')}, which the others need, and {secret}, which stays here")
         return 0
     if given.scene is None or given.listen is None:
         raise CommandError("--scene START and --listen ADDRESS say what to begin with and where the others hear it")

@@ -195,8 +195,11 @@ def test_without_keys_only_this_machine_is_spoken_to():
         Link("A", "tcp://127.0.0.1:5601", {"B": "tcp://192.168.0.2:5602"})
 
 
-def test_keys_that_are_there_stay_and_those_that_are_not_are_named(tmp_path):
-    make_keys(tmp_path, "A")
+def test_keys_that_are_there_stay_and_those_that_are_not_are_named(tmp_path, capsys):
+    assert agent.main(["--name", "A", "--make_keys", "--keys", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert f"{tmp_path / 'A.key'}, which the others need" in said
+    assert f"{tmp_path / 'A.key_secret'}, which stays here" in said
     before = (tmp_path / "A.key_secret").read_text()
     with pytest.raises(ValueError, match=r"A\.key_secret is there already"):
         make_keys(tmp_path, "A")
