@@ -42,6 +42,16 @@ def draw_list(console: Console, name: str | None) -> bool:
     return not registry.failures()
 
 
+def family_of(kind: type[Reader]) -> str:
+    """Of the body that a data set's shape numbers belong to."""
+    return next(iter(kind.shapes_of), kind.family)
+
+
+def body_of(kind: type[Reader]) -> str:
+    """Options with which a data set is prepared; "": the open body will do, which is the shipped model's."""
+    return BODIES.get(family_of(kind), "")
+
+
 def show_reader(console: Console, kind: type[Reader]) -> None:
     """A data set whose download is prepared."""
     console.print(f"[bold cyan]{kind.name}[/]  {kind.title}", soft_wrap=True)
@@ -50,15 +60,14 @@ def show_reader(console: Console, kind: type[Reader]) -> None:
     wide = max((len(pattern) for pattern, _ in kind.layout), default=0)
     for number, (pattern, what) in enumerate(kind.layout):
         show(console, "" if number else "under --root", f"{pattern:<{wide}}  {what}")
-    family = next(iter(kind.shapes_of), kind.family)
-    body = BODIES.get(family, "")
+    body = body_of(kind)
     model = " --data.body_model SMPLX_NEUTRAL.npz" if body else ""
     show(console, "then", f"magnet data prepare {kind.name} --root DOWNLOAD --out STORE {body}".rstrip())
-    if not body:  # the open one will do, which is the shipped model's
+    if not body:
         show(console, "", f"magnet fit --config {TUNING} --data.path STORE   # {WHERE_CONFIGS}")
     show(console, "", f"{registry.fit_command(registry.data_of(kind))} --data.path STORE{model}")
     if body:
-        show(console, "", WHERE[family])
+        show(console, "", WHERE[family_of(kind)])
     if kind.fake:
         show(console, "to try it out", f"magnet data fake {kind.name} FAKE")
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from magnet.body import Body, load_body
 from magnet.cli import data_shown
+from magnet.cli.data_list import body_of
 from magnet.cli.data_options import job_of
 from magnet.datamodules import registry
 from magnet.datamodules.clip import MOST, at_least, at_most
@@ -165,7 +166,8 @@ def run_fake(given: argparse.Namespace) -> int:
     with writing(folder, "choose another --out"):
         kind.write_fake(folder, given.takes, given.frames, given.seed)
     files = [path for path in folder.rglob("*") if path.is_file()]
-    body = f" --body {shlex.quote(str(folder / 'body.npz'))}" if (folder / "body.npz").is_file() else ""
+    made = folder / "body.npz"
+    body = f" --body {shlex.quote(str(made))}" if body_of(kind) and made.is_file() else ""
     print(f"{len(files)} files of a made-up {name} are in {folder}. To prepare it:")
     print(f"  magnet data prepare {name} --root {shlex.quote(str(folder))} --out STORE{body}")
     return 0

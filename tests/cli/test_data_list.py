@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from magnet import cli
 from magnet.cli.data_list import draw_list
 from magnet.datamodules import registry
 from tests.cases import few
@@ -49,6 +50,14 @@ def test_one_is_told_of_by_the_name_of_its_files_or_of_its_class(name: str, titl
     console = Console(record=True, width=120)
     assert draw_list(console, name)
     assert console.export_text().startswith(f"{title}  ")
+
+
+@pytest.mark.parametrize(("name", "body"), [("bvh", ""), ("cmu", ""), ("dd100", " --body dl/body.npz")])
+def test_a_made_up_download_is_prepared_with_the_body_that_the_list_says(name, body, tmp_path, monkeypatch, capsys):
+    """Files of one's own with the open one, so that the shipped model goes on with their store."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["data", "fake", name, "dl", "--takes", "1", "--frames", "12"]) == 0
+    assert f"magnet data prepare {name} --root dl --out STORE{body}\n" in capsys.readouterr().out
 
 
 def test_the_body_is_that_of_a_data_sets_shape_numbers() -> None:
