@@ -84,7 +84,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         for cell, seconds in zip(todo, times, strict=True):
             print(f"{seconds:6.0f} s  {cell.name}")
         total = clock(sum(times))
-        print(f"{len(wanted)} cells, {len(wanted) - len(todo)} done; the other {len(todo)} may take {total}")
+        guessed = any(not store.of_kind(kind) for kind in {cell.kind for cell in todo})
+        how = ", guessed for the budget small where none of a kind is done" * guessed
+        print(f"{len(wanted)} cells, {len(wanted) - len(todo)} done; the other {len(todo)} may take {total}{how}")
         return 0
     if not given.page_only:
         runner.run(wanted)
