@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from magnet.cli.errors import CommandError, no_such
 from magnet.cli.flags import PlainParser, flat
+from magnet.errors import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -117,7 +118,8 @@ def show(a: Side, b: Side, full: bool) -> None:
     alone = a.folder is b.folder  # one folder was named
     names = (a.row, b.row) if alone and a.row != b.row else (f"{a.row} (A)", f"{b.row} (B)")
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
-    console.print(f"{names[0]} and {names[1]}, {len(common)} scenes of both ({units} independent)", style="bold")
+    scenes = f"{counted(len(common), 'scene')} of both ({units} independent)"
+    console.print(f"{names[0]} and {names[1]}, {scenes}", style="bold")
     for letter, side in zip("A" if alone else "AB", (a, b), strict=False):
         kept = side.results.meta.get("checkpoint")
         trained = f", checkpoint {kept}" if kept not in (None, "None") else ""

@@ -49,7 +49,7 @@ def print_results(results: Results, folder: Path, full: bool = False) -> None:
 
     full: all that was measured, with intervals; else the main metrics, of methods as they are aligned
     """
-    title = f"{results.meta.get('task', 'test')}, {results.meta.get('test scenes', '?')} test scenes"
+    title = f"{results.meta.get('task', 'test')}, {counted(results.meta.get('test scenes', 0), 'test scene')}"
     console = Console() if sys.stdout.isatty() else Console(width=WIDE)
     aligned = {method: row for method, row in results.rows.items() if method not in UNALIGNED}
     shown = results if full else replace(results, rows=aligned)
