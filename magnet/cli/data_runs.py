@@ -67,8 +67,9 @@ def run_info(given: argparse.Namespace) -> int:
 def run_check(given: argparse.Namespace) -> int:
     path = Path(needed(given, "path")[0]).expanduser()
     if holds_store(path):
-        picture = picture_of(given, StoreReader(path).manifest["name"])
-        found, body = checked_store(given, path)
+        folder = StoreReader(path)
+        picture = picture_of(given, folder.manifest["name"])
+        found, body = checked_store(given, folder)
     elif not path.is_dir():
         raise ValueError(f"{path} is not a folder; give a store or the folder of a download")
     else:
@@ -99,12 +100,12 @@ def picture_of(given: argparse.Namespace, name: str) -> Path | None:
     return picture
 
 
-def checked_store(given: argparse.Namespace, path: Path) -> tuple[check.CheckReport, Body | None]:
+def checked_store(given: argparse.Namespace, folder: StoreReader) -> tuple[check.CheckReport, Body | None]:
     """What was found, and the body to draw."""
     refuse_unused(given)
     body = load_body(given.body) if given.body != "open" else None
     with progress_bar() as tell:
-        return check.check_store(StoreReader(path), body, tell), body
+        return check.check_store(folder, body, tell), body
 
 
 def checked_download(given: argparse.Namespace, name: str, path: Path) -> tuple[check.CheckReport, Body]:
