@@ -38,9 +38,13 @@ def test_a_hand_of_a_keyframe_goes_up_with_its_arrow_and_nowhere_else(page, pane
         app.follow = False
         (client,) = app.server.get_clients().values()
         on_stage = np.array(app.root.position)
-        with client.atomic():  # so near that the arrow is 100 pixels long and 15 wide
-            client.camera.look_at = on_stage + limb.handle.position
-            client.camera.position = client.camera.look_at + np.array([0.9, 0.4, 1.2])
+
+        def look() -> None:
+            """From so near that the arrow is 100 pixels long and 15 wide; a drag that misses it turns the camera."""
+            with client.atomic():
+                client.camera.position = on_stage + limb.handle.position + np.array([0.9, 0.4, 1.2])
+                client.camera.look_at = on_stage + limb.handle.position
+            page.wait_for_timeout(500)
 
         def hand() -> torch.Tensor:
             return limb_places(live.keys[0], "left hand", body, live.scene.betas[0, 0])[0]
@@ -49,6 +53,7 @@ def test_a_hand_of_a_keyframe_goes_up_with_its_arrow_and_nowhere_else(page, pane
 
         def dragged() -> bool:
             """Drag its arrow up 10 cm; whether the hand went with it, and not where the arrow is not drawn yet."""
+            look()
             shot(page, "limb_arrows")
             before, start = hand(), on_stage + limb.handle.position + np.array([0.0, 0.22, 0.0])
             way = [pixel(client.camera, start + np.array([0.0, 0.012 * step, 0.0])) for step in range(9)]
