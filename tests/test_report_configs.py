@@ -31,7 +31,11 @@ ROWS: dict[str, dict[str, Any]] = {
     "per_sequence_noise": {"model.init_args.noise.distribution": "per_sequence"},
     "pairwise_token_noise": {"model.init_args.noise.pairwise": "token"},
     "skip": {f"{NETWORK}.skip": True},
-    "self_forcing": {"model.init_args.self_forcing.share": 0.3},
+    "mixture": {"model.init_args.noise.distribution": "mixture"},
+    "self_forcing": {
+        "model.init_args.noise.distribution": "mixture",
+        "model.init_args.self_forcing.share": 0.3,
+    },
     "causal": {f"{NETWORK}.causal_block": 1},
 }
 """Rows that are trainings, and all that each changes of the base."""
