@@ -40,7 +40,7 @@ HUB = "hub:"
 HUB_FILES = ["config.json", "*.safetensors", "README.md"]
 
 MOTION = (".npz", ".pkl", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
-"""Suffixes of scenes, which are no checkpoints: `magnet.export.reading.READ`, which this may not import."""
+"""Suffixes of scenes alone: `magnet.export.reading.READ`, which this may not import, without .pt, which models have."""
 KEPT = ("hyper_parameters", "tokenizer_hyper_parameters", "magnet_config")
 
 

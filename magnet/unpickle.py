@@ -2,7 +2,7 @@
 
 A pickle may hold numpy arrays and numbers, text, bytes, numbers, None, dict, list, tuple and set; a defaultdict becomes
 a dict, and anything else that it names is refused. Arrays are rebuilt here, from bytes whose number must fit, so that a
-damaged header neither reserves memory nor reaches numpy's own unpickling.
+damaged header neither reserves memory nor reaches numpy's own unpickling. What joblib wrote is read, too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,14 +138,16 @@ def unpickled(data: bytes, where: str, also: Also | None = None) -> Any:
             f"{where}: is compressed, expected a plain pickle. If you trust the file, {BY_HAND['joblib.']} and save "
             "plain arrays"
         )
+    also = also or (lambda module, name: None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # damaged text has escapes that mean nothing
-            for opcode, argument, _ in pickletools.genops(data):
+            joblib = all(word.encode() in data for word in WRAPPER)
+            for opcode, argument, _ in () if joblib else pickletools.genops(data):
                 # A damaged memo index would make the unpickler reserve and fill gigabytes.
                 if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > len(data):
                     raise DataError(f"{where}: not a whole pickle (entry {argument} in {len(data)} bytes); {AGAIN}")
-            held = _Restricted(data, where, also or (lambda module, name: None)).load()
+            held = (_Joblib if joblib else _Restricted)(io.BytesIO(data), where, also).load()
         return _plain(held, where, {}, 0)
     except DataError as error:
         raise error if str(error).startswith(where) else DataError(f"{where}: {error}") from error
@@ -261,6 +263,8 @@ BY_HAND = {
     "torch.": "load it yourself, make arrays of its tensors by .cpu().numpy()",
 }
 """How a trusted file of some packages' classes is opened, by how their modules begin."""
+WRAPPER = ("joblib.numpy_pickle", "NumpyArrayWrapper")
+"""Module and name of what joblib pickles for an array, whose numbers it writes behind that."""
 COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b", b"BZh", b"\xfd7zXZ")
 """How the bytes of zlib, gzip, bz2 and xz begin, and those of no pickle."""
 
@@ -278,10 +282,11 @@ class _Call:
         raise DataError(f"not a whole pickle (it changes a function); {AGAIN}")
 
 
-class _Restricted(pickle.Unpickler):
-    def __init__(self, data: bytes, where: str, also: Also) -> None:
-        super().__init__(io.BytesIO(data), encoding="latin-1")
-        self.where, self.also = where, also
+class _Admitting:
+    """What both unpicklers let a pickle name."""
+
+    where: str
+    also: Also
 
     def find_class(self, module: str, name: str) -> Any:
         """Only what is admitted."""
@@ -298,6 +303,55 @@ class _Restricted(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> Any:
         """Refused."""
         raise DataError(f"{self.where}: the pickle refers to an object outside it ({pid!r}); {AGAIN}")
+
+
+class _Restricted(_Admitting, pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, where: str, also: Also) -> None:
+        super().__init__(file, encoding="latin-1")
+        self.where, self.also = where, also
+
+
+class _Joblib(_Admitting, pickle._Unpickler):
+    """Reads what joblib wrote: behind the state of a wrapper the numbers of its array follow in the file.
+
+    Opcodes cannot be looked through here: it is Python's unpickler, which fills memory before it reads for bytearrays
+    alone, and here for none.
+    """
+
+    def __init__(self, file: io.BytesIO, where: str, also: Also) -> None:
+        super().__init__(file, encoding="latin-1")
+        self.where, self.also, self.file = where, also, file
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What is admitted, and the wrapper."""
+        own = (module, name) == WRAPPER
+        return type("_Wrapped", (_Wrapped,), {"unpickler": self}) if own else super().find_class(module, name)
+
+    def _load_bytes(self) -> None:
+        self.append(self.read(int.from_bytes(self.read(8), "little")))  # type: ignore[attr-defined]
+
+    dispatch: ClassVar[dict[int, Any]] = {**pickle._Unpickler.dispatch, pickle.BYTEARRAY8[0]: _load_bytes}
+
+
+class _Wrapped(StandIn):
+    """An array of which joblib has pickled a description, and written the numbers behind it."""
+
+    unpickler: _Joblib
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__(state)
+        reader, dtype, shape = self.unpickler, self.state["dtype"].real(), tuple(self.state["shape"])
+        if dtype.char == "O":
+            self.array = _Joblib(reader.file, reader.where, reader.also).load()
+            return
+        if self.state.get("numpy_array_alignment_bytes") is not None:  # since joblib 1.3: how many bytes to pass over
+            reader.file.read(reader.file.read(1)[0])
+        count, fortran = math.prod(shape), self.state["order"] == "F"
+        self.array = _array(reader.file.read(count * dtype.itemsize), dtype, shape, fortran, reader.where)
+
+    def real(self, inner: Callable[[Any], Any]) -> Any:
+        """The array."""
+        return self.array if isinstance(self.array, np.ndarray) else inner(self.array)
 
 
 def _plain(found: Any, where: str, done: dict[int, Any], depth: int) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import bz2
 import gzip
 import lzma
@@ -203,3 +204,76 @@ def test_what_is_refused_is_said_with_how_a_trusted_file_is_opened(held: bytes, 
     (tmp_path / "file.pkl").write_bytes(held)
     with pytest.raises(DataError, match=f"If you trust the file, .*{how}"):
         load_pickle(tmp_path / "file.pkl")
+
+
+JOBLIB_WROTE = {
+    2: (
+        "eNplUk1v0zAYdhLajLSMQmF8DBjfZBwqgTjsgLShShyI1Em9kAuK4tTFGfl6HUeo0iKVw7ZWyg3DmV/IXxiO2xU2LNuy36/neR97qpeA"
+        "HK0EzXYbCKEszUkOenCQ4ijEvaSIs4mXhcGXiFiD+vKOMX/ykflZRpgFxvY3uFRCw3bXZHJe4CDy8xyagUq0kpFfh1tgquI59TMCa47u"
+        "GMdwWZlSNiIMLFeT5z60lG3EJzKsvayhbhZccXXpGr+B9fnsBK4OoWM7hkp7C9cGg8GHUznU5iAO17FrSZcfRelXL479DLozd1NaFg0p"
+        "Vp4fhZ+TmCTcwxMuu77hdAq8fnpuIDWmu3Lbk1OuqVy/9tymtPCCJWQEN2ktw0YJt2zapCatG9SP4TZdtPUe7tA2XfAPX8Pdmv/mEO5J"
+        "/vR/5vcx7c6oomIofB1pyECuWYuFD0jAc3igALdKeLgCPIJH1KKtFdD+DjyugZ4M4emZUIfw7DzcLofnEm6+gJs2fvxetIuqDaVTzwtS"
+        "RnpxEfFQSSaqtsdIkCY5Z0XAxXdRNVSkqMzlW0ubg45EX8PiRAyF7WiSnKBG1VAPWafo+ztCclNeo9IOxUVWAs8/Cbvq/ktCngkLA1G1"
+        "vDFLY1yMx4TJavZPfUkaaYK2K7149bc47VzUV+CaTqX1BZchAyINPfXpSJzxCbxQytolbJ8pi+q/+nKpbWf1NubyfxR57w8U9iRO"
+    ),
+    4: (
+        "eNqFUs1O3DAQdrKkQFnRbRGIqi+wPTRSqx44IEGFxIFIQXDhVEVx1luH5k+OLRSpSNsDdFfyrZOeeTYegFcIk2S3pOyhI9saOzP5vvlm"
+        "JivlPWntGhzjGobaytKc5aC3LlMahdROVJwVXhYG3yMG+rVbX78I4RcXws8yJuA3vP8JdeZarmgQ+TkmW00W6NVk5NexGKStnPsZA8d0"
+        "erd4S8UIk7VxhP5IFviFry88jDbHn2E2/QXnMHR62tgH13VPKrTmcIgEql/6UZReeXHsZzDV71qmDZ7nR+G3JGaJ9GghsRxnoKhZVW2p"
+        "kwM8DnHhnuC+OyzP5yroF1KJhI2AW21VfI1v8D6SNm+Bb2rjGPiAv9Fm+OmJHt9ZJsd3p/xtjdqvOkaISQzSI+XZAm81pZcskPkS4A3C"
+        "8Vct2OleV4sfz7Q4aOBmLdzEKh8W/95pFLG9IBXMjlUkw7YZuu8JFqRJLoUKZNOb5X455AaODAotrNEQ6nUb9H9Ss684FVtdEugzEQag"
+        "N7yxSGOqxuNmgoZ/zDlpYgDva1N97Mg7WJa3plPPjsQQl+GDXX5YlG2xOJPFc0FJPXZzSbf/dmez+sdUbj8CNxY2+w=="
+    ),
+}
+"""One file of joblib 1.6.0 by protocol, zlib and base64: joblib.dump of `HELD`, its second array in Fortran's order."""
+HELD = {
+    1: {
+        "poses": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "turned": np.arange(4, dtype=np.int16).reshape(2, 2),
+        "objects": np.array([np.arange(2, dtype=np.uint8), None], dtype=object),
+        "empty": np.zeros((0, 3), dtype=np.float32),
+    }
+}
+
+
+def wrote(protocol: int) -> bytes:
+    return zlib.decompress(base64.b64decode(JOBLIB_WROTE[protocol]))
+
+
+@pytest.mark.parametrize("protocol", JOBLIB_WROTE)
+def test_what_joblib_wrote_comes_back_as_it_was(protocol: int, tmp_path: Path) -> None:
+    path = tmp_path / "file.pkl"
+    path.write_bytes(wrote(protocol))
+    got = load_pickle(path)[1]
+    assert list(got) == list(HELD[1]) and got["objects"][1] is None and same(got["objects"][0], HELD[1]["objects"][0])
+    assert all(same(got[name], HELD[1][name]) for name in ("poses", "turned", "empty"))
+
+
+@pytest.mark.parametrize("protocol", JOBLIB_WROTE)
+def test_damage_in_what_joblib_wrote_is_a_data_error_that_names_the_file(protocol: int, tmp_path: Path) -> None:
+    path, whole, draw = tmp_path / "file.pkl", wrote(protocol), np.random.default_rng(0)
+    damaged = [whole[:size] for size in range(0, len(whole), 3)]
+    for _ in range(400):
+        bent = bytearray(whole)
+        for place in draw.integers(len(whole), size=3):
+            bent[place] = draw.integers(256)
+        damaged.append(bytes(bent))
+    refused = 0
+    for data in damaged:
+        path.write_bytes(data)
+        try:
+            load_pickle(path)  # a number of an array may be another and nobody can tell
+        except DataError as error:
+            refused += 1
+            assert str(error).startswith(str(path))
+    assert refused > len(damaged) / 2
+
+
+def test_a_wrapper_of_joblibs_lets_nothing_else_be_named(tmp_path: Path) -> None:
+    path = tmp_path / "file.pkl"
+    path.write_bytes(wrote(4).replace(b"\x8c\x05numpy\x94\x8c\x07ndarray", b"\x8c\x05posix\x94\x8c\x06system", 1))
+    with pytest.raises(DataError, match=r"file\.pkl"):
+        load_pickle(path)
+    path.write_bytes(b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n0cposix\nsystem\n(S'true'\ntR.")
+    with pytest.raises(DataError, match=r"names posix\.system, which is not loaded"):
+        load_pickle(path)

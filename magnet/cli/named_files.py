@@ -8,7 +8,7 @@ from pathlib import Path
 
 from magnet.cli.errors import CommandError
 
-READ = (".npz", ".pkl", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
+READ = (".npz", ".pkl", ".pt", ".bvh", ".glb", ".gltf", ".vrm", ".vrma", ".fbx", ".csv")
 """`magnet.export.reading.READ`, which would import torch."""
 MOST_PIECES = 6
 """Pieces that a path with spaces may have come in."""

@@ -18,10 +18,10 @@ from magnet.sampling.presets import PRESETS
 HELP = "magnet predict --help files"
 
 EPILOG = """\
-IN is a .bvh, .glb, .gltf, .vrma or .fbx of any skeletons, a .csv of joint positions, a .npz or .pkl of SMPL's family
-or a scene of ours; several are several people of one world, in the order in which they are named: A.bvh is person 0.
-Everything is brought to 30 frames a second and, where other programs wrote it, onto the floor. The suffix of OUT says
-what is written, as for `magnet export`; several OUT are several kinds.
+IN is a .bvh, .glb, .gltf, .vrma or .fbx of any skeletons, a .csv of joint positions, a .npz, .pkl or .pt of SMPL's
+family or a scene of ours; several are several people of one world, in the order in which they are named: A.bvh is
+person 0. Everything is brought to 30 frames a second and, where other programs wrote it, onto the floor. The suffix of
+OUT says what is written, as for `magnet export`; several OUT are several kinds.
 
 for example:
   magnet predict A.bvh B.bvh --out out.glb                               how it goes on for both

@@ -47,7 +47,7 @@ OUT: dict[str, Any] = {"metavar": "OUT", "help": "file to write; its suffix says
 def parser_of(command: str, description: str | None, epilog: str, inputs: str = "+") -> PlainParser:
     """A parser that knows IN."""
     options = PlainParser(command, description, epilog)
-    files = "a .npz, .pkl, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people"
+    files = "a .npz, .pkl, .pt, .bvh, .glb, .gltf, .vrma, .fbx or .csv; several are several people"
     options.add_argument("inputs", nargs=inputs, metavar="IN", help=files)
     return options
 
@@ -88,7 +88,7 @@ def require_files_to_cut(inputs: Sequence[str], start: int, end: int | None) -> 
 
 def add_origin(options: Options) -> None:
     """--in_fps, --in_unit, --up, --keep_floor and --joint, for files of other programs."""
-    fps = "frames a second of .npz, .pkl, .csv without it"
+    fps = "frames a second of .npz, .pkl, .pt, .csv without it"
     options.add_argument("--in_fps", type=float, metavar="FPS", help=fps)
     unit = "m, cm, mm, inch or foot (default: by the length of legs; of .npz m)"
     options.add_argument("--in_unit", metavar="UNIT", help=unit)

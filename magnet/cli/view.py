@@ -41,7 +41,9 @@ over ssh: magnet view FILE --no_browser, and on your own machine ssh -L 8080:loc
 def arguments_of(words: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = PlainParser("view", "Watch scenes in the browser, or let a model play while you interfere.", EXAMPLES)
-    files = "scenes (.npz), SMPL-X motion (.npz, .pkl), recordings of denoising, .bvh, .glb, .gltf, .vrma, .fbx, .csv"
+    files = (
+        "scenes (.npz), SMPL-X motion (.npz, .pkl, .pt), recordings of denoising, .bvh, .glb, .gltf, .vrma, .fbx, .csv"
+    )
     parser.add_argument("files", nargs="*", metavar="FILE", help=files)
     shown = parser.add_argument_group("what is shown")
     add = shown.add_argument

@@ -33,10 +33,9 @@ from magnet.export.smpl_keys import (
     rotations,
     there_in_world,
 )
-from magnet.export.smpl_people import PERSON, is_posed, one_of, people_in, without_gaps
+from magnet.export.smpl_people import PERSON, PICKLED, held_in, is_posed, one_of, people_in, without_gaps
 from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
-from magnet.unpickle import load_pickle
 
 WIDTH = 66
 """Numbers of the pelvis and 21 body joints."""
@@ -46,7 +45,7 @@ FAMILIES = {69: "smpl", 72: "smpl", 156: "smplh", 165: "smplx"}
 
 @register_reader
 class ScenesReader(OwnReader[PosedTrack]):
-    """A folder of npz and pkl files of SMPL's family, one person or several each, or of scenes that magnet wrote.
+    """A folder of npz, pkl and pt files of SMPL's family, one person or several each, or of scenes that magnet wrote.
 
     Keys may have any of the usual names (poses or root_orient and pose_body, trans or transl, betas, mocap_frame_rate
     or fps). Pickles are read without running code in them. SMPL's hand joints and SMPL-X's fingers and face are left
@@ -66,10 +65,11 @@ class ScenesReader(OwnReader[PosedTrack]):
     title: ClassVar[str] = "Scenes of SMPL's family"
     fake: ClassVar[str] = "magnet.datamodules.fakes.scenes"
     family: ClassVar[Family] = "any"
-    suffixes: ClassVar[tuple[str, ...]] = (".npz", ".pkl")
+    suffixes: ClassVar[tuple[str, ...]] = (".npz", *PICKLED)
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("NAME_{A,B}.npz", "a person each, of SMPL's family; other ways to say who is together are in docs/own.md"),
-        ("NAME.pkl", "the same of one or several people, such as {person1: {poses, trans, betas}}"),
+        ("NAME.pkl", "the same of one or several people, such as {person1: {poses, trans, betas}}; joblib's, too"),
+        ("NAME.pt", "the same as torch saved it, such as GVHMR's hmr4d_results.pt"),
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
@@ -88,8 +88,8 @@ class ScenesReader(OwnReader[PosedTrack]):
     def open(self, person_file: PersonFile, alone: bool) -> tuple[list[PosedTrack], list[str]]:
         """The people in a file."""
         path = person_file.file
-        if path.suffix.lower() == ".pkl":
-            held: Any = load_pickle(path)
+        if path.suffix.lower() in PICKLED:
+            held: Any = held_in(path)
         else:
             keys = _keys(path)
             if "meta" in keys and not is_posed(dict.fromkeys(keys)):

@@ -19,13 +19,10 @@ from magnet.export.read_options import Reading
 from magnet.export.rig import UP
 from magnet.export.smpl_clock import FRAMES, Numbers, SharedClock, frame_numbers, require_one_beginning, shared_clock
 from magnet.export.smpl_keys import posed
-from magnet.export.smpl_people import HELD, gap_note, people_in
+from magnet.export.smpl_people import HELD, PICKLED, gap_note, held_in, people_in
 from magnet.export.upright import agreed, axis_of, said, told_against
 from magnet.files import load_npz
 from magnet.motion.scene import Scene
-from magnet.unpickle import load_pickle
-
-PICKLE = ".pkl"
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ def read_people(files: Sequence[Path], body: Body, options: Reading) -> list[Npz
     somebody was not seen hold who was seen before, and are not valid. files: one for each person, or one for all.
 
     Returns:
-        Of each file everybody, or, where a pkl holds people by name, each of them.
+        Of each file everybody, or, where a file of objects holds people by name, each of them.
 
     Raises:
         ValueError: a file that cannot be read, or of another body; an option that a file of ours contradicts; no such
@@ -157,8 +154,8 @@ def _of_one_axis(people: Sequence[NpzFile], body: Body) -> list[NpzFile]:
 def _read(path: Path, body: Body, options: Reading, alone: bool) -> list[NpzFile]:
     """What a file holds, and how it was read. alone: no other file is of the scene"""
     how = (options.up, options.unit, options.in_fps)
-    if path.suffix.lower() == PICKLE:
-        there = list(people_in(path, load_pickle(path)))
+    if path.suffix.lower() in PICKLED:
+        there = list(people_in(path, held_in(path)))
         read = [_foreign(path, where, one, scene_of(where, one, body, *how), body, options.up) for where, one in there]
         if options.up is None:
             read = _of_one_world(read)

@@ -13,10 +13,11 @@ from magnet.export.cutting import rates_note, shared_frames, together
 from magnet.export.formats import WRITTEN
 from magnet.export.gltf_file import GLTF
 from magnet.export.joints_read import load_joints
-from magnet.export.npz_files import PICKLE, is_ours, read_people
+from magnet.export.npz_files import is_ours, read_people
 from magnet.export.read_options import Reading
 from magnet.export.retarget import load_rigs
 from magnet.export.rig_files import RIGS
+from magnet.export.smpl_people import PICKLED
 from magnet.export.unread import advice_for
 from magnet.export.upright import WARNING
 from magnet.files import regular
@@ -25,7 +26,7 @@ from magnet.motion.rotations import to_rotvec
 from magnet.motion.scene import Scene
 
 TABLE = ".csv"
-ARRAYS = (".npz", PICKLE)
+ARRAYS = (".npz", *PICKLED)
 READ = (*ARRAYS, *RIGS, TABLE)
 """Suffixes that can be read."""
 UNSEEN = 0.0005
@@ -48,7 +49,7 @@ class Read:
 def read(
     paths: str | Path | Sequence[str | Path], body: str | Path | Body | None = None, options: Reading | None = None
 ) -> Read:
-    """Read a scene from a Scene npz, or SMPL's npz and pkl, BVH, GLB, FBX or CSV files; several are several people.
+    """Read a scene from a Scene npz, or SMPL's npz, pkl and pt, BVH, GLB, FBX or CSV files; several are several people.
 
     Args:
         body: the scene's body model, or its file; None: the open one.
@@ -66,7 +67,7 @@ def read(
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
         rigs = ", ".join(RIGS)
         raise ValueError(
-            f"cannot read {names}: expected {' and '.join(ARRAYS)}, or {TABLE} files alone, or files of skeletons "
+            f"cannot read {names}: expected {', '.join(ARRAYS)}, or {TABLE} files alone, or files of skeletons "
             f"({rigs}){only}{advice_for(suffixes)}"
         )
     for file in files:

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnet.errors import DataError
+from magnet.export.smpl_clock import FRAMES
 from magnet.export.smpl_keys import BODY, ORIENT, PLACE, RATE, SCALE, WHOLE, posed
 from magnet.motion.runs import filled
-from magnet.unpickle import mapping
+from magnet.torch_files import load_tensors
+from magnet.unpickle import load_pickle, mapping
 
 Doubles = NDArray[np.float64]
 
@@ -20,10 +22,23 @@ PERSON = "name of the person"
 """Our key for what somebody is called in a dict of people."""
 HELD = "they hold the pose before, and are not valid"
 """What happens in a scene to frames in which somebody was not tracked."""
+PICKLED = (".pkl", ".pt")
+"""Suffixes of files of objects: pickles, also joblib's, and what torch saved."""
 IN_WORLD, SEEN = "_global", "_incam"
 """In the names under which trackers keep somebody twice: in the world, and as a camera sees them."""
+PEOPLE, WORLD_OF = "people", "smplx_world"
+"""Under which PromptHMR keeps who is in a video, and what each of them does in the world, beside `frames`."""
 SHARED = (*RATE, "gender", SCALE, "body")
 """Keys that a file may have once for all its people."""
+
+
+def held_in(path: Path) -> Any:
+    """What a file of `PICKLED` holds, without running code in it.
+
+    Raises:
+        DataError: as `load_pickle` and `load_tensors`.
+    """
+    return load_tensors(path) if path.suffix.lower() == ".pt" else load_pickle(path)
 
 
 def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
@@ -44,7 +59,7 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
         if twice := [key for key, name in numbers.items() if name in held]:
             raise DataError(f"{path}: has two people {twice[0]}, one by number and one by text; rename one")
         held = {numbers.get(key, key): value for key, value in held.items()}
-    held = mapping(path, held)
+    held = _of_prompt_hmr(mapping(path, held))
     if is_posed(held):
         yield str(path), held
         return
@@ -61,6 +76,19 @@ def people_in(path: Path, held: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for p, (key, value) in enumerate(inside.items()):
         mine = {shared_key: one_of(said, p) for shared_key, said in shared.items()}
         yield f"{path}, {key}", {**mine, PERSON: key, **mapping(f"{path}, {key}", value)}
+
+
+def _of_prompt_hmr(held: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What PromptHMR writes as people by name, each with their motion in the world; anything else as it is."""
+    people = held.get(PEOPLE, held)
+    if not isinstance(people, Mapping):
+        return held
+    found = {
+        str(name): {FRAMES: one.get("frames"), **one[WORLD_OF]}
+        for name, one in people.items()
+        if isinstance(one, Mapping) and isinstance(one.get(WORLD_OF), Mapping)
+    }
+    return found or held
 
 
 def is_posed(held: Any) -> bool:

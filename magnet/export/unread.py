@@ -12,7 +12,6 @@ TENSORS = "load it with torch.load, and save its tensors as NumPy arrays in an .
 ADVICE = {
     ".c3d": MARKERS,
     ".trc": MARKERS,
-    ".pt": TENSORS,
     ".pth": TENSORS,
     ".npy": "an array alone does not tell what it is: save rotations as poses, trans and mocap_frame_rate in an .npz, "
     "positions of joints as a table, .csv",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from magnet.body import load_body
 from magnet.datamodules.fakes.motion import people
@@ -198,6 +199,42 @@ def test_who_is_in_a_file_in_the_world_and_as_a_camera_sees_them_is_one_person(t
     assert np.allclose(found.transl[:, 0], one["trans"])
     assert read_scene(tmp_path / "video.pkl", options=Reading(in_fps=30.0)).scene.agents == 1
     assert len(read(tmp_path, {"anna_incam": one, "ben_incam": one}).persons) == 2
+
+
+def test_what_torch_saved_is_read_as_a_pickle_of_the_same_is(tmp_path: Path) -> None:
+    one = {key: torch.from_numpy(value).float() for key, value in seen(0, [*range(60)], False).items()}
+    root, body = one["pose"][:, :3], one["pose"][:, 3:66]
+    world = {"body_pose": body, "global_orient": root, "transl": one["trans"], "betas": one["betas"]}
+    held = {"smpl_params_global": world, "smpl_params_incam": world | {"transl": torch.zeros(60, 3)}}
+    torch.save({**held, "K_fullimg": torch.eye(3).expand(60, 3, 3), "net_outputs": {}}, tmp_path / "video.pt")
+    found = read(tmp_path)
+    assert (found.frames, len(found.persons)) == (60, 1) and found.transl is not None
+    assert np.allclose(found.transl[:, 0], one["trans"])
+    shown = read_scene(tmp_path / "video.pt", options=Reading(in_fps=30.0)).scene
+    (tmp_path / "video.pt").unlink()
+    arrays = {name: {key: value.numpy() for key, value in part.items()} for name, part in held.items()}
+    wanted = read(tmp_path, arrays)
+    assert found.poses is not None and wanted.poses is not None and (found.poses == wanted.poses).all()
+    pickled = read_scene(tmp_path / "video.pkl", options=Reading(in_fps=30.0)).scene
+    assert (pickled.T_world_root == shown.T_world_root).all() and (pickled.body_rot == shown.body_rot).all()
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["people", "alone"])
+def test_people_of_prompt_hmr_are_read_in_the_world_at_the_frames_they_were_seen_in(
+    inside: bool, tmp_path: Path
+) -> None:
+    people_seen = {}
+    for p, frames in enumerate(([*range(50)], [*range(20, 60)])):
+        one = seen(p, frames, False)
+        pose = np.concatenate([one["pose"][:, :66], np.zeros((len(frames), 99))], axis=1)
+        world = {"pose": pose, "trans": one["trans"], "shape": one["betas"]}
+        camera = {key: np.zeros_like(value) for key, value in world.items()}
+        people_seen[p + 1] = {"track_id": p + 1, "frames": np.array(frames), "smplx_cam": camera, "smplx_world": world}
+    held = {"camera": {"img_focal": 1000.0}, "people": people_seen, "masks": None} if inside else people_seen
+    found = read(tmp_path, held)
+    assert (found.frames, found.persons) == (30, ("1", "2")) and off(found, 20) < 1e-5
+    shown = read_scene(tmp_path / "video.pkl", options=Reading(in_fps=30.0))
+    assert (shown.scene.agents, shown.scene.frames) == (2, 30)
 
 
 def test_what_a_file_has_is_named_by_its_own_keys(tmp_path: Path) -> None:
