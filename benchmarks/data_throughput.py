@@ -68,6 +68,8 @@ def main() -> None:
     words.add_argument("--body", default=None, help="of --store; default: body.npz in it")
     words.add_argument("--measure", nargs=2, default=None, help=argparse.SUPPRESS)
     given = words.parse_args()
+    if 0 < given.fit_steps < 4:
+        words.error(f"--fit_steps {given.fit_steps}: the second half is timed, so it takes 4 or more")
     if given.measure:
         print(json.dumps(measure(given, given.measure[0], Path(given.measure[1]))))
         return
