@@ -34,7 +34,9 @@ DENOISER: dict[str, Any] = {
     "self_forcing": {"share": 0.0, "placement": "fuse", "pairwise_weight": 0.02, "displaced": 0.0, "far": 0.0},
     "optimizer": {**ADAMW, "warmup_steps": 1000},
     "sampling": dict.fromkeys(("stride", "pyramid_offset", "turn", "opening", "settle", "smooth_path", "together"))
-    | dict.fromkeys(("noise_scale", "stabilization_level", "stabilization_beside", "stabilization_unseen"))
+    | dict.fromkeys(
+        ("pairwise_weight", "noise_scale", "stabilization_level", "stabilization_beside", "stabilization_unseen")
+    )
     | {"stabilization_after": 0},
     "cuda_graph": False,
     **RUN,

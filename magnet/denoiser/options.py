@@ -207,6 +207,7 @@ class Sampling:
         pyramid_offset: denoising steps from a token to the next; 0: the tokens of a stride are denoised together.
         turn: token steps of a turn, where agents take turns and their task leaves it open.
         opening: more denoising steps at the highest noise where nothing in a window is known.
+        pairwise_weight: weight of a pairwise transform against a delta.
         settle: how poses are corrected.
         smooth_path: whether paths over the floor are smoothed.
         together: metres that couples stay within where scenes go on for long.
@@ -221,6 +222,7 @@ class Sampling:
     pyramid_offset: int | None = None
     turn: int | None = None
     opening: int | None = None
+    pairwise_weight: float | None = None
     settle: Settling | None = None
     smooth_path: bool | None = None
     together: float | None = None

@@ -132,7 +132,7 @@ class BodyGuidance:
         T_self_partner = from_9d(pairwise_by_frame(pairs)) if world.model.layout.slots else None
         made = place(
             T_prev_can, T_self_partner, world.starts(T_prev_can, T_self_partner, row, ~known), options.placement,
-            options.pairwise_weight, present=seen, fixed=known, anchor=seen.int().argmax(dim=1),
+            options.weight_of_pairs, present=seen, fixed=known, anchor=seen.int().argmax(dim=1),
         )  # fmt: skip
         frames = slice(row * TOKEN_FRAMES, (row + n) * TOKEN_FRAMES)
         stands = world.rows_by_frame(world.placed[row : row + n])[..., None, None] & ~gone[:, None, None]

@@ -114,7 +114,7 @@ class Places:
             T_self_partner,
             self.starts(T_prev_can, T_self_partner, first, new),
             placement,
-            self.options.pairwise_weight,
+            self.options.weight_of_pairs,
             present=there,
             fixed=known,
             anchor=first_of(there),

@@ -32,6 +32,7 @@ def require_spacing(spacing: str, shift: float) -> None:
         )
 
 
+PAIRWISE_WEIGHT = 0.02
 MOST_WEIGHT, MOST_BLEND = 1e6, 1_000_000
 """Of a pairwise transform and frames of a blend: beyond, numbers overflow."""
 LEAST_SPACING, MOST_SPACING = 1.5, 1000.0
@@ -64,7 +65,8 @@ class SamplerOptions:
         placement: how predicted deltas and pairwise transforms become world poses: `integrate` (the
             reference), `anchor`, or `fuse` (ours).
         pairwise_weight: weight of a pairwise transform against a delta in `fuse`; chosen on the validation take: deltas
-            are far more certain than pairwise transforms, so a little is enough (docs/experiments_sampling.md).
+            are far more certain than pairwise transforms, so a little is enough (docs/experiments_sampling.md). None:
+            as the model is best sampled, or 0.02.
         apart: keep people out of each other's bodies: each finished block is moved over the ground so far that nobody
             is in another, and the model goes on from there (ours, `magnet.body.apart`): `off`, `light` or `firm`.
         body_guidance: push what is expected out of collisions while sampling: a step down the energy of bodies together
@@ -121,7 +123,7 @@ class SamplerOptions:
     turn: int | None = None
     opening: int | None = None
     placement: Placement = "fuse"
-    pairwise_weight: float = 0.05
+    pairwise_weight: float | None = None
     apart: Separation = "off"
     body_guidance: Separation = "off"
     settle: Settling | None = None
@@ -162,7 +164,8 @@ class SamplerOptions:
         for name in ("pyramid_offset", "opening"):
             if getattr(self, name) is not None:
                 require_whole(name, getattr(self, name), 0, LEVELS)
-        require_number("pairwise_weight", self.pairwise_weight, 0, MOST_WEIGHT)
+        if self.pairwise_weight is not None:
+            require_number("pairwise_weight", self.pairwise_weight, 0, MOST_WEIGHT)
         require_whole("blend", self.blend, 0, MOST_BLEND)
         require_number("crowd_enter", self.crowd_enter, over=0)
         require_number("crowd_leave", self.crowd_leave, least=self.crowd_enter)
@@ -183,6 +186,11 @@ class SamplerOptions:
         require_spacing(self.spacing, self.shift)
         if self.compile and self.precision == "reference":
             raise ValueError("compile: the precision reference is the network as it was trained; take float32 or int8")
+
+    @property
+    def weight_of_pairs(self) -> float:
+        """`pairwise_weight`, or what it is where neither options nor model say it."""
+        return PAIRWISE_WEIGHT if self.pairwise_weight is None else self.pairwise_weight
 
     def filled(self, best: Any) -> SamplerOptions:
         """These options where they say something; what they leave open from another object's fields of that name."""

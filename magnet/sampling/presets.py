@@ -21,7 +21,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "opening": 0,
         "turn": 1,  # 3.3: P(A_t | ...), then P(B_t | A_t, ...)
         "placement": "integrate",  # the paper does not say; the released code's
-        "pairwise_weight": 0.05,  # not read by `integrate`
+        "pairwise_weight": 0.02,  # not read by `integrate`
         "requantize": True,  # the paper does not say; the released code's
         "keep_given": True,  # 3.3: what is given stays as given
         "blend": 0,  # the paper smooths nothing after decoding

@@ -213,6 +213,9 @@ def test_a_level_left_open_is_the_model_s_and_a_level_that_is_named_stays():
 def test_new_noise_is_scaled_as_the_model_says_where_there_is_any():
     assert SamplerOptions().filled(Sampling(turn=2)).turn == 2
     assert SamplerOptions().filled(Sampling(opening=5)).opening == 5
+    assert SamplerOptions().filled(Sampling(pairwise_weight=0.05)).weight_of_pairs == 0.05
+    assert SamplerOptions(pairwise_weight=0.0).filled(Sampling(pairwise_weight=0.05)).weight_of_pairs == 0
+    assert SamplerOptions().filled(Sampling()).weight_of_pairs == SamplerOptions().weight_of_pairs == 0.02
     for preset in ("paper", "steady"):
         assert SamplerOptions.preset(preset).filled(Sampling(opening=5)).opening == 0
     assert SamplerOptions(turn=1).filled(Sampling(turn=2)).turn == 1
