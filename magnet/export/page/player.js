@@ -144,20 +144,22 @@ class Player {
     this.meta = meta;
     this.time = 0;
     this.speed = 1;
-    this.playing = true;
+    this.playing = !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.loop = true;
     this.drawn = 0;
+    this.seen = true;
     const canvas = document.getElementById("canvas");
     this.motion = new Motion(meta, arrays);
     this.picture = new Picture(canvas, meta, arrays);
     this.view = new View(canvas, meta, arrays);
     this.labels = meta.takes.map(() => document.getElementById("labels").appendChild(document.createElement("div")));
-    for (const label of this.labels) label.style.maxWidth = `min(24ch, ${100 / meta.takes.length}%)`; // side by side
     this.controls();
     this.choose(ALL);
+    const middles = this.labels.map((_, take) => this.centre(this.view.shown.filter((person) => person.take === take)));
+    this.apart = Math.min(...middles.slice(1).map((middle, take) => middle[0] - middles[take][0])); // metres
     let last = performance.now();
     const tick = (now) => {
-      this.advance(Math.max(0, now - last) / 1000); // the first one may lie before the page was ready
+      if (this.seen) this.advance(Math.max(0, now - last) / 1000); // the first one may lie before the page was ready
       last = now;
       requestAnimationFrame(tick);
     };
@@ -248,6 +250,7 @@ class Player {
       const place = people.length && this.overhead(people);
       label.hidden = !place;
       if (!place) continue;
+      label.style.maxWidth = `clamp(12ch, ${this.gap()}px, 24ch)`; // beside its neighbours, but whole words
       label.textContent = [meta.takes[take], this.said(people, take)].filter((text) => text).join(": ");
       const { offsetWidth: wide, offsetHeight: tall } = label;
       const right = this.picture.canvas.clientWidth - wide / 2;
@@ -262,6 +265,13 @@ class Player {
     const depth = this.view.marks ? this.picture.marks.deepest(this.frame, take) : 0;
     const deep = depth > 0 ? `${Math.round(100 * depth)} cm in each other` : "";
     return [this.view.said(this.frame, people), deep].filter((text) => text).join(" \u00b7 ");
+  }
+
+  // Pixels from a take to the next.
+  gap() {
+    const { distance, azimuth } = this.view;
+    const metre = this.picture.canvas.clientHeight / (2 * Math.tan(FIELD / 2) * distance);
+    return metre * this.apart * Math.abs(Math.cos(azimuth));
   }
 
   // Where on the page a take's label is.
@@ -311,11 +321,22 @@ class Player {
   }
 }
 
-try {
-  window.player = new Player(readData());
-} catch (error) {
-  const failed = document.getElementById("failed");
-  failed.style.display = "flex";
-  failed.textContent = error.message;
-  throw error;
+function begin() {
+  try {
+    window.player = new Player(readData());
+  } catch (error) {
+    const failed = document.getElementById("failed");
+    failed.style.display = "flex";
+    failed.textContent = error.message;
+    throw error;
+  }
 }
+
+// A notebook may hold many of these pages, and a browser drops the oldest of over 16 pictures: a page begins when it is
+// first in sight, stands still while it is not, and begins anew if its picture was dropped.
+new IntersectionObserver((changes) => {
+  const seen = changes.at(-1).isIntersecting;
+  if (window.player) player.seen = seen;
+  else if (seen) begin();
+  if (seen && window.player && player.picture.gl.isContextLost()) location.reload();
+}).observe(document.body);
