@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -69,6 +70,7 @@ class Registry:
         self.known: dict[str, Registered] = {}
         self.failed: list[Failed] = []
         self.discovered = False
+        self._lock = threading.RLock()  # a plug-in may ask for what there is while it is loaded itself
 
     def add(self, name: str, kind: type, origin: str) -> None:
         """Make a class known, in place of itself as it was, where its definition runs again (a notebook's cell).
@@ -83,11 +85,20 @@ class Registry:
             raise ValueError(f"{self.what} name {name} is taken by {known.kind.__module__}.{known.kind.__qualname__}")
         self.known[name] = Registered(name, kind, origin)
 
-    def discover(self, again: bool = False) -> bool:
-        """Load all classes, once. -> whether anything was loaded"""
-        if self.discovered and not again:
-            return False
-        self.discovered = True
+    def discover(self, again: bool = False, others: Callable[[], None] = lambda: None) -> None:
+        """Load all classes, once, then `others`; other threads wait for it. One that was interrupted begins anew."""
+        with self._lock:
+            if self.discovered and not again:
+                return
+            self.discovered = True
+            try:
+                self._load_all()
+                others()
+            except BaseException:
+                self.discovered = False
+                raise
+
+    def _load_all(self) -> None:
         self.failed.clear()
         for module in self.modules:
             importlib.import_module(module)
@@ -102,10 +113,9 @@ class Registry:
             if (known := self.known.get(each.name)) is not None:  # which is what the name gives, without a word
                 why = f"is not used, {each.name} is of {known.origin}: {told(each.error)}"
                 self._warn(each.name, each.origin, why)
-        return True
 
     def _warn(self, name: str, origin: str, what: str) -> None:
-        warnings.warn(f"entry point {name} of {self.group} ({origin}) {what}", stacklevel=3)
+        warnings.warn(f"entry point {name} of {self.group} ({origin}) {what}", stacklevel=4)
 
     def load(self, name: str, load: Callable[[], type], origin: str) -> list[str]:
         """Load a plug-in. Its class may have registered itself with a decorator, which does not know the origin.

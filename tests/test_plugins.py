@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable
 
@@ -49,7 +50,7 @@ def test_one_that_fails_is_left_out_with_its_reason(
 ) -> None:
     registry, points = offered
     points += [Point("Bad", raising(error)), Point("good", lambda: int)]
-    assert registry.discover()
+    registry.discover()
     assert set(registry.known) == {"good"} and registry.failed == [plugins.Failed("Bad", error, "of_Bad:Thing")]
     with pytest.raises(ValueError) as caught:
         registry.require_loaded("bad")
@@ -124,3 +125,28 @@ def test_what_ends_the_process_is_no_failure_of_a_plug_in(
     points.append(Point("bad", raising(error)))
     with pytest.raises(type(error)):
         registry.discover()
+    points[:] = [Point("good", lambda: int)]
+    registry.discover()  # as where a notebook's cell is interrupted and run again
+    assert set(registry.known) == {"good"}
+
+
+def test_a_thread_that_asks_while_another_loads_waits_for_it(offered: tuple[plugins.Registry, list[Point]]) -> None:
+    registry, points = offered
+    seen: list[set[str]] = []
+
+    def ask() -> None:
+        registry.discover()
+        seen.append(set(registry.known))
+
+    other = threading.Thread(target=ask)
+
+    def slow() -> type:
+        registry.discover()  # a plug-in itself does not wait
+        other.start()
+        other.join(0.2)
+        return int
+
+    points.append(Point("late", slow))
+    registry.discover()
+    other.join()
+    assert seen == [{"late"}]

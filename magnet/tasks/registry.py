@@ -52,9 +52,12 @@ def register_task(name: str, origin: str = "magnet") -> Callable[[T], T]:
 
 def discover(again: bool = False) -> None:
     """Load all tasks, once: ours, those of packages, and those that the variable MAGNET_TASKS names."""
-    if TASKS.discover(again):
-        for value in filter(None, os.environ.get(VARIABLE, "").split(",")):
-            _load_variable(value.strip())
+    TASKS.discover(again, _load_variables)
+
+
+def _load_variables() -> None:
+    for value in filter(None, os.environ.get(VARIABLE, "").split(",")):
+        _load_variable(value.strip())
 
 
 def _load_variable(value: str) -> None:
