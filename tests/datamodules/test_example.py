@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -64,6 +66,23 @@ def test_it_is_listed_checked_prepared_and_trained_on(
     (batch,) = data.train_dataloader()
     assert tuple(batch.T_world_root.shape) == (2, 32, 2, 4, 4)
     assert data.folder.clips("test")[0].name == "waltz_2"
+
+
+@pytest.mark.slow
+def test_several_processes_prepare_it_where_its_module_was_only_imported(
+    waltzes: ModuleType, download: Path, tmp_path: Path, capsys
+) -> None:
+    command = ["data", "prepare", "waltzes", "--root", str(download), str(tmp_path / "store"), "--workers", "2"]
+    assert cli.main(command) == 0, capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_one_that_a_notebook_defines_is_prepared_there(download: Path, tmp_path: Path) -> None:
+    cell = (EXAMPLE / "magnet_duel/waltzes.py").read_text(encoding="utf-8")
+    command = ["data", "prepare", "waltzes", "--root", str(download), str(tmp_path / "store"), "--workers", "2"]
+    cell += f"\nfrom magnet.cli import main\nraise SystemExit(main({command}))\n"  # as there, in no file
+    run = subprocess.run([sys.executable, "-c", cell], capture_output=True, text=True, timeout=600, check=False)
+    assert run.returncode == 0, run.stderr
 
 
 def test_its_reader_says_what_is_wrong_with_a_file(waltzes: ModuleType, download: Path, tmp_path: Path) -> None:

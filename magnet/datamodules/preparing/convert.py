@@ -6,6 +6,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -295,8 +296,11 @@ def relative(text: str, root: Path) -> str:
 _HERE: dict[str, Any] = {}
 
 
-def begin(job: PrepareJob) -> None:
-    """Set up a worker process: one thread, its own reader and body; it ends when its parent is gone."""
+def begin(job: PrepareJob, kind: type[Reader]) -> None:
+    """Set up a worker process: one thread, its own reader and body; it ends when its parent is gone.
+
+    That `kind`, the reader's class, has come here has imported its module, which registers it.
+    """
     torch.set_num_threads(1)
     threading.Thread(target=_follow_parent, daemon=True).start()
     _HERE.update(job=job, reader=job.reader(), body=job.body(), bodies=job.bodies())
@@ -341,10 +345,16 @@ def convert_all(
         yield take, part
 
 
+def in_a_notebook(kind: type) -> bool:
+    """Whether a class was defined where no other process finds it: in no file."""
+    return kind.__module__ == "__main__" and not hasattr(sys.modules["__main__"], "__file__")
+
+
 def _converted(
     job: PrepareJob, takes: list[Take], file: Callable[[Take], Path | None], workers: int
 ) -> Iterator[tuple[Take, ConvertedTake]]:
-    if workers == 1 or len(takes) < 2:
+    kind = registry.reader(job.name)
+    if workers == 1 or len(takes) < 2 or in_a_notebook(kind):
         reader, body, bodies = job.reader(), job.body(), job.bodies()
         for take in takes:
             with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
@@ -353,7 +363,7 @@ def _converted(
             yield take, part
         return
     spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job,))
+    pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job, kind))
     try:
         running = {pool.submit(work, take, file(take)): take for take in takes}
         for future in as_completed(running):  # looks at each once; `wait` looks at all that run, each time
