@@ -38,7 +38,7 @@ from magnet.files import (
 )
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
-from magnet.viewer.takes import read_takes
+from magnet.viewer.reading import read_takes
 
 HERE = "choose another --out"
 

@@ -2,6 +2,8 @@
 
 import ast
 import functools
+import importlib
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,6 +35,15 @@ def test_no_function_is_longer_than_a_screen() -> None:
         if isinstance(node, functions) and (lines := node.end_lineno - node.lineno + 1) > MOST_FUNCTION_LINES
     }
     assert not long
+
+
+def test_what_a_package_offers_is_not_hidden_by_a_module_of_that_name() -> None:
+    files = (path.parent for path, _, _ in parsed("magnet") if path.name == "__init__.py")
+    packages = [importlib.import_module(".".join(folder.parts)) for folder in files]
+    offered = {
+        f"{each.__name__}.{name}": getattr(each, name) for each in packages for name in vars(each).get("__all__", ())
+    }
+    assert not [name for name, value in offered.items() if inspect.ismodule(value)]
 
 
 def test_the_frame_rate_of_models_is_written_once() -> None:

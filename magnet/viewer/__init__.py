@@ -2,6 +2,6 @@
 
 from magnet.export.page.html import save_html
 from magnet.export.page.takes import ShownTake, take, takes
-from magnet.viewer.takes import read_takes
+from magnet.viewer.reading import read_takes
 
 __all__ = ["ShownTake", "read_takes", "save_html", "take", "takes"]

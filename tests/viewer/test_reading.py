@@ -15,7 +15,7 @@ from magnet.export.read_options import Reading
 from magnet.export.trace import DenoisingTrace
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
-from magnet.viewer.takes import read_takes
+from magnet.viewer.reading import read_takes
 
 
 def test_a_scene_files_samples_are_takes_with_labels_that_differ(tmp_path: Path, scene: Scene, body: Body) -> None:
