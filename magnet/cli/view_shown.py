@@ -29,8 +29,8 @@ from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
 from magnet.tasks.base import schedule_of
 from magnet.viewer.live_app import LiveApp
-from magnet.viewer.scene_view import RenderOptions
 from magnet.viewer.reading import read_takes
+from magnet.viewer.scene_view import RenderOptions
 from magnet.viewer.watch import Viewer, default_render_options
 
 EXAMPLE = "duet"

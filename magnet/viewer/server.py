@@ -16,6 +16,8 @@ from collections.abc import AsyncIterator, Iterator
 from typing import Any, cast
 from urllib.parse import urlsplit
 
+import rich
+
 AT_ONCE = "Object.defineProperty(document, 'hidden', {configurable: true, get: () => true})"
 TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
 """Lets viser's page (1.1) take up what it is sent at once, as it does in tabs that are out of sight.
@@ -41,12 +43,7 @@ def start(host: str, port: int, title: str) -> Any:
     """
     viser = require_viser()
     port = free_port(host, port)
-    # viser greets with a box of its own; ours says more.
-    with (
-        open(os.devnull, "w", encoding="utf-8") as nowhere,
-        contextlib.redirect_stdout(nowhere),
-        own_pages_only(is_local(host)),
-    ):
+    with ungreeted(), own_pages_only(is_local(host)):
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if server.get_port() != port:
         server.stop()
@@ -54,6 +51,17 @@ def start(host: str, port: int, title: str) -> Any:
     server.gui.add_html(TOGETHER)
     only_values_of_pages(server)
     return server
+
+
+@contextlib.contextmanager
+def ungreeted() -> Iterator[None]:
+    """viser's own greeting, a box of rich that notebooks show wherever stdout leads, is left out: ours says more."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def is_local(name: str | None) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rich
 
 from magnet.body import Body
 from magnet.export.page.takes import take
@@ -112,6 +113,18 @@ def test_a_server_stops_soon_and_wholly_though_a_browser_no_longer_answers(
             time.sleep(0.05)
         assert not set(threading.enumerate()) - before
     assert not caplog.records
+
+
+@pytest.mark.parametrize("notebook", [False, True])
+def test_viser_greets_nobody(notebook: bool, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    pytest.importorskip("viser")
+    shown: list[Any] = []
+    monkeypatch.setattr("rich.jupyter.display", lambda *what: shown.append(what))
+    monkeypatch.setattr(rich.get_console(), "is_jupyter", notebook)
+    server = start("127.0.0.1", 0, "test")
+    greeting = capsys.readouterr().out, list(shown)
+    server.stop()
+    assert greeting == ("", [])
 
 
 def test_a_viser_that_starts_otherwise_is_refused_and_not_left_open() -> None:
