@@ -9,6 +9,7 @@ import re
 import signal
 import string
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -182,8 +183,9 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         kept=told.append if given.out else lambda _: None,
         speed=given.speed,
     )
-    for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
-        signal.signal(number, signal.default_int_handler)
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
+            signal.signal(number, signal.default_int_handler)
     print(f"magnet agent: {given.name} is at {given.listen}   (Ctrl+C ends it)", file=sys.stderr, flush=True)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -356,6 +357,16 @@ def test_an_agent_who_hears_nobody_says_so(
     words = ["--name", "A", "--scene", str(folder / "two.npz"), "--model", str(folder / "model.ckpt")]
     assert agent.main([*words, "--listen", addresses_of("A")["A"]]) == 0
     assert "A runs alone, and hears nobody: --connect B=tcp://HOST:PORT" in capsys.readouterr().err
+
+
+def test_agents_may_be_threads(folder: Path, tmp_path: Path) -> None:
+    scene, where = str(folder / "two.npz"), addresses_of("AB")
+    words = ["--scene", scene, "--play", scene, "--pace", "others", "--seconds", "0.5"]
+    with ThreadPoolExecutor(2) as threads:  # as in a notebook
+        for name, other in ("AB", "BA"):
+            place = ["--listen", where[name], "--connect", f"{other}={where[other]}", "--out", str(tmp_path / name)]
+            threads.submit(agent.main, [*words, "--name", name, "--person", str("AB".index(name)), *place])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["A.npz", "B.npz"]
 
 
 @pytest.mark.parametrize("trained", ["smplx-neutral", "open-1"])
