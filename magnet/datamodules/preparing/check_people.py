@@ -95,7 +95,7 @@ def check_stature(rest: Array, names: Sequence[str] = ()) -> None:
 def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
     """Valid frames (T, P) without those whose numbers are no motion, and flags for the latter."""
     found: list[Flag] = []
-    for mask, what in _nonsense(recording):
+    for mask, what in _nonsense(recording, valid):
         for person in range(valid.shape[1]):
             bad = mask[:, person] & valid[:, person]
             found += [Flag(person, a, b, what) for a, b in true_runs(bad)]
@@ -108,27 +108,27 @@ def screened(recording: Recording, valid: Bools) -> tuple[Bools, list[Flag]]:
     return valid, found
 
 
-def _nonsense(recording: Recording) -> list[tuple[Bools, str]]:
-    """Masks (T, P) of frames that are no motion, and what they are."""
+def _nonsense(recording: Recording, valid: Bools) -> list[tuple[Bools, str]]:
+    """Masks (T, P) of frames that are no motion, and what they are; what is not valid may be anything."""
     found: list[tuple[Bools, str]] = []
     with np.errstate(all="ignore"):  # of frames that are not valid
         place = recording.transl if recording.pelvis is None else recording.pelvis
         if recording.poses is not None and place is not None:
             size = np.abs(recording.poses).max(axis=(2, 3))
             found.append((size > WILD_ANGLE, f"rotations of more than {WILD_ANGLE:g} radians"))
-            found.append((_far(place[:, :, None]), "a place more than a thousand kilometres off"))
+            found.append((_far(place[:, :, None], valid), "a place more than a thousand kilometres off"))
             nowhere = (size == 0) & (np.abs(place).max(axis=-1) == 0)
             found.append((nowhere, "all rotations and the place are exactly 0"))
         elif recording.positions is not None:
-            found.append((_far(recording.positions), "joints more than a million units off"))
+            found.append((_far(recording.positions, valid), "joints more than a million units off"))
             nowhere = (recording.positions == recording.positions[:, :, :1]).all(axis=(2, 3))
             found.append((nowhere, "all joints are at one point"))
     return found
 
 
-def _far(places: Array) -> Bools:
+def _far(places: Array, valid: Bools) -> Bools:
     """(T, P, M, 3) -> (T, P)"""
-    middle = np.nanmedian(places, axis=(0, 2), keepdims=True)
+    middle = np.nanmedian(np.where(valid[..., None, None], places, np.nan), axis=(0, 2), keepdims=True)
     return np.abs(places - middle).max(axis=(2, 3)) > WILD_PLACE
 
 

@@ -70,6 +70,28 @@ def test_a_frame_is_valid_when_all_it_is_made_of_is():
     assert np.flatnonzero(~resample_valid(valid, 50.0)[:, 0]).tolist() == [5]
 
 
+@pytest.mark.parametrize("kind", few([recorded, tracked], 1))
+def test_what_frames_hold_that_are_not_valid_makes_no_difference(kind):
+    """Also of somebody who is away most of the time, and then as far off as some trackers say."""
+    motion = people(90, 2, seed=5)
+    valid = np.ones((90, 2), dtype=bool)
+    valid[:55, 1] = False
+    recording = replace(kind(motion), valid=valid)
+    (clip,) = canonicalize(recording, BODY, "take", "made", "train").clips
+    assert clip.name == "take [55:90]"
+    for filler in (np.nan, 0.0, 1e12):
+        arrays = {
+            name: np.array(getattr(recording, name))
+            for name in ("poses", "transl", "positions")
+            if getattr(recording, name) is not None
+        }
+        for array in arrays.values():
+            array[~valid] = filler
+        outcome = canonicalize(replace(recording, **arrays), BODY, "take", "made", "train")
+        assert torch.equal(outcome.clips[0].scene.T_world_root, clip.scene.T_world_root)
+        assert torch.equal(outcome.clips[0].scene.body_rot, clip.scene.body_rot)
+
+
 @pytest.mark.parametrize(("up", "kind"), few([*((up, recorded) for up in UP), ("-z", tracked)]))
 def test_the_same_motion_comes_out_whatever_axis_is_up(up, kind):
     motion = people(60, 2, seed=5) if kind is recorded else people(30, 1, seed=5)  # a fit takes its time
