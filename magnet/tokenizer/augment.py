@@ -26,6 +26,7 @@ def swap_limbs(scene: Scene, probability: float, generator: torch.Generator) -> 
     """Replace limbs, each with a probability, by the same limb of another person in the batch.
 
     A few minutes of dance hold few combinations of upper and lower bodies; the tokenizer should not memorize them.
+    Limbs come only from people whose frames are valid wherever one's own are.
     """
     B, P = scene.present.shape
     people = scene.present.flatten().nonzero()[:, 0]
@@ -37,6 +38,10 @@ def swap_limbs(scene: Scene, probability: float, generator: torch.Generator) -> 
         joints = torch.tensor(limb, device=flat.device) - 1
         chosen = people[_rand(len(people), generator, flat) < probability]
         donors = people[(_rand(len(chosen), generator, flat) * len(people)).long()]
+        if scene.valid is not None:
+            good = scene.valid.repeat_interleave(P, dim=0)  # (B P, T)
+            covers = (good[donors] | ~good[chosen]).all(dim=1)
+            chosen, donors = chosen[covers], donors[covers]
         mixed[chosen[:, None], :, joints] = flat[donors[:, None], :, joints]
     return scene.replace(body_rot=mixed.unflatten(0, (B, P)).transpose(1, 2))
 

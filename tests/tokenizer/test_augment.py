@@ -36,6 +36,23 @@ def test_absent_agents_and_the_pelvis_stay_as_they_are(people, generator):
     assert torch.equal(swap_limbs(people, 1.0, generator).T_world_root, people.T_world_root)
 
 
+def test_limbs_come_only_from_frames_that_are_valid(people, generator):
+    """Of a clip that is shorter than the window the last pose is repeated; nobody else's arm hangs still for that."""
+    valid = torch.ones(3, 16, dtype=torch.bool)
+    valid[0, 8:] = False
+    mixed = swap_limbs(people.replace(valid=valid), 1.0, generator)
+    short = people.body_rot[0].transpose(0, 1)  # (P, T, 21, 3, 3)
+    for own in mixed.body_rot[2].unbind(1):
+        given = [torch.equal(own[:, joints], each[:, joints]) for joints in limbs() for each in short]
+        assert not any(given)
+    assert not torch.equal(mixed.body_rot[2], people.body_rot[2]), "from others they do"
+    assert not torch.equal(mixed.body_rot[0], people.body_rot[0]), "who is short takes from anybody"
+
+
+def limbs() -> list[torch.Tensor]:
+    return [torch.tensor(limb) - 1 for limb in LIMBS.values()]
+
+
 def test_nobody_to_exchange_with_leaves_a_person_alone(people, generator):
     alone = people.select([1])
     assert torch.equal(swap_limbs(alone, 1.0, generator).body_rot, alone.body_rot)
