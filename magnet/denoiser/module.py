@@ -21,7 +21,7 @@ from magnet.denoiser.token_model import TokenModel
 from magnet.denoiser.transformer import is_sharded
 from magnet.motion.scene import Scene, all_valid
 from magnet.motion.tokens import TOKEN_FRAMES
-from magnet.sampling.noise import add_noise
+from magnet.sampling.noise import LEVELS, add_noise
 from magnet.seeding import derive, step_generator
 from magnet.training import origins
 from magnet.training.optim import warmup_cosine
@@ -180,6 +180,8 @@ class Denoiser(DenoiserCore, TokenModel):
             scene = named.replace(names=())  # by which a GPU would be waited for
             truth = self.normalizer.normalize(tokens)
             levels, noise = drawn(self.noise, truth.shape, generator, scene.present, self.places)
+            # What was not tracked, or lies behind a clip's end, is unknown, not people who stand still.
+            levels = levels.masked_fill(scene.present[:, None] & ~there[..., 0], LEVELS)
             if made is not None:
                 levels, there = levels.masked_fill(made[..., None], 0), there & ~made[..., None, None]
             group_levels = layout.group_levels(levels)

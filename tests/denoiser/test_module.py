@@ -167,6 +167,22 @@ def test_what_a_gap_in_the_recording_says_is_learnt_by_nobody():
     assert torch.equal(counted[0], there[0]) and counted[1, :2].equal(there[1, :2])
 
 
+@pytest.mark.parametrize(
+    "options", few([{}, {"noise": {"distribution": "mixture"}, "self_forcing": {"share": 1.0}}], 1), ids=str
+)
+def test_what_is_not_valid_is_not_shown_either(options):
+    """The same losses whatever a gap holds, and frames behind the end of a clip that is shorter than the window."""
+    model, generator = tiny_denoiser(**options).train(), torch.Generator().manual_seed(2)
+    scene, other = (random_scene(4, 32, 3, generator) for _ in range(2))
+    valid = torch.ones(4, 32, dtype=torch.bool)
+    valid[:2, 10:16] = valid[2:, 20:] = False
+    masked = scene.replace(valid=valid)
+    spoiled = masked.with_poses(~valid[..., None], other.body_rot, 3 * other.T_world_root)
+    for seed in range(4):
+        plain, same = (model.losses(each, torch.Generator().manual_seed(seed)) for each in (masked, spoiled))
+        assert all(torch.equal(value, same[name]) for name, value in plain.items())
+
+
 def test_a_few_scenes_can_be_learnt(tmp_path):
     model = build(tmp_path, optimizer={"learning_rate": 3e-3}, network={"width": 64})
     fitted(model, 1)
