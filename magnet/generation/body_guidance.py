@@ -161,6 +161,7 @@ class BodyGuidance:
             place_shift = shift[:, :, slots].clone().requires_grad_()
             given = world.given.slice(frames.start, frames.stop).permute_agents(slots)
             given = given.replace(**{name: value.clone() for name, value in given.tensors().items()})
+            given.betas[~given.present] = 0.0  # of a slot that is free in this scene they may not even be finite
             features = world.model.tokenizer.decode(leaf, given.betas, deltas[:, :, slots].clone())[:, :T]
             made = posed(features, T_world_can, given)
             real = world.rows_by_frame(world.known[frames.start // TOKEN_FRAMES : frames.stop // TOKEN_FRAMES])[

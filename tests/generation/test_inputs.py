@@ -233,6 +233,22 @@ def test_absent_agents_may_hold_anything(model, duet):
     assert torch.equal(sampled[0].T_world_root[:, :, :2], sampled[1].T_world_root[:, :, :2])
 
 
+def test_absent_agents_may_hold_anything_where_poses_are_pushed_apart(model):
+    """A free slot of one scene is somebody's of the other."""
+    present = torch.tensor([[True, False, True], [False, True, True]])
+    scene = random_scene(2, CONTEXT, 3, torch.Generator().manual_seed(1), present)
+    junk = scene.replace(
+        T_world_root=torch.where(present[:, None, :, None, None], scene.T_world_root, math.nan),
+        betas=torch.where(present[..., None], scene.betas, math.nan),
+    )
+    options = SamplerOptions(steps=3, body_guidance="firm", apart="firm", settle="hold", settle_blocks=True)
+    made, again = (
+        generate(model, each, JointFuture(), CONTEXT, 8, 1, options, torch.Generator().manual_seed(0))
+        for each in (scene, junk)
+    )
+    assert torch.equal(again.T_world_root, made.T_world_root) and torch.equal(again.body_rot, made.body_rot)
+
+
 def test_which_scene_agent_and_frame_is_wrong_is_said(model):
     scene = random_scene(3, 48, 2, torch.Generator().manual_seed(1)).replace(names=("a", "b", "c"))
     T = scene.T_world_root.clone()
