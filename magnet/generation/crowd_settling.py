@@ -127,6 +127,7 @@ def _settle(scene: Scene, moment: Encounter, ground: Tensor) -> None:
     start, stop = max(moment.start - AROUND // 2, 0), min(moment.stop + AROUND // 2, scene.frames)
     two = torch.tensor([moment.one, moment.other], device=scene.device)
     away = torch.cdist(ground[start:stop, two], ground[start:stop]).amin(dim=(0, 1))
+    away = torch.where(scene.present[0], away, torch.inf)
     away[two] = torch.inf
     beside = away.argsort()[:BESIDE]
     part = scene.slice(start, stop).permute_agents(torch.cat([two, beside[away[beside] < ARM_REACH]]))

@@ -48,6 +48,15 @@ def test_who_is_given_does_not_make_way() -> None:
     assert torch.equal(made.body_rot[:, :, 0], scene.body_rot[:, :, 0]) and depth(made) < depth(scene)
 
 
+def test_free_slots_take_nobodys_place_beside_two_who_meet() -> None:
+    """They hold nobody at the origin, where two pass each other, in front of a third whom they must not step into."""
+    scene = passing()
+    crowd = scene.pad_agents(12)
+    made, among = settled_moments(scene), settled_moments(crowd)
+    assert torch.equal(among.T_world_root[:, :, :5], made.T_world_root)
+    assert torch.equal(among.T_world_root[:, :, 5:], crowd.T_world_root[:, :, 5:])
+
+
 def test_a_crowd_that_keeps_apart_is_left_as_it_is() -> None:
     scene = passing().permute_agents(torch.tensor([0, 2, 3, 4]))
     assert settled_moments(scene) is scene
