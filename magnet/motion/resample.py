@@ -106,11 +106,12 @@ def resampled(scene: Scene, fps: float) -> Scene:
     low, high, share = times(scene.frames, scene.fps, fps)
     low, high, share = low.to(scene.device), high.to(scene.device), share.to(scene.T_world_root)
     place = scene.T_world_root[..., :3, 3]
+    exact = share == 0
+    high = torch.where(exact, low, high)  # of a frame that is taken as it is the next one may not even be finite
     moved = torch.lerp(place[:, low], place[:, high], share[:, None, None])
     turned = _slerp_frames(scene.T_world_root[..., :3, :3], low, high, share)
-    exact = share == 0
-    valid = None if scene.valid is None else scene.valid[:, low] & (scene.valid[:, high] | exact)
-    given = None if scene.given is None else scene.given[:, low] & (scene.given[:, high] | exact[:, None])
+    valid = None if scene.valid is None else scene.valid[:, low] & scene.valid[:, high]
+    given = None if scene.given is None else scene.given[:, low] & scene.given[:, high]
     body_rot = _slerp_frames(scene.body_rot, low, high, share)
     return scene.replace(body_rot=body_rot, T_world_root=rigid(turned, moved), valid=valid, given=given, fps=float(fps))
 

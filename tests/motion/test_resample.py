@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from magnet.motion.resample import at_speed
+from magnet.motion.resample import at_speed, resampled
 from magnet.motion.rotations import geodesic
 from magnet.testing import random_scene
 
@@ -32,6 +32,15 @@ def test_a_frame_made_of_a_bad_one_is_bad(generator):
     valid[:, 5] = False
     half = at_speed(scene.replace(valid=valid), 0.5)
     assert (~half.valid)[0].nonzero()[:, 0].tolist() == [9, 10, 11]
+
+
+def test_what_lies_between_frames_that_stay_may_be_anything(generator):
+    scene = random_scene(1, 11, 1, generator)
+    valid = torch.ones(1, 11, dtype=torch.bool)
+    valid[:, 5] = False
+    lost = scene.with_poses(~valid[..., None], torch.tensor(torch.nan), torch.tensor(torch.nan))
+    half = resampled(lost.replace(valid=valid), 15.0)
+    assert torch.equal(half.T_world_root, scene.T_world_root[:, ::2]) and half.valid.all()
 
 
 def test_a_speed_is_positive(generator):
