@@ -107,7 +107,7 @@ class NearestNeighbour(Retrieval):
         begin = self.train.slice(0, frames)
         features = [context_features(begin.select(slice(i, i + CHUNK))) for i in range(0, begin.scenes, CHUNK)]
         own, pair = torch.cat([each.own for each in features]), torch.cat([each.pair for each in features])
-        present = self.train.present
+        present = self.train.present & self.usable[:, None]
         other = ~torch.eye(self.train.agents, dtype=torch.bool, device=present.device)
         both = present[:, :, None] & present[:, None, :] & other
         steps = (frames + TOKEN_FRAMES - 1) // TOKEN_FRAMES

@@ -38,6 +38,7 @@ class Retrieval:
         usable = train.present.any(dim=1)
         if train.valid is not None:
             usable &= train.valid.all(dim=1)
+        self.usable = usable
         people = torch.where(usable, train.present.sum(dim=1), 0)
         self.stretches = {n: (people == n).nonzero()[:, 0] for n in sorted(set(people.tolist()) - {0})}
 
@@ -133,8 +134,10 @@ def best_move(T_world_from: Tensor, T_world_to: Tensor, present: Tensor) -> Tens
     Least squares over positions and, with `LEVER`, headings, so that one person alone is enough.
     (B, P, 4, 4), (B, P, 4, 4), (B, P) bool -> (B, 4, 4) float64
     """
-    yaw_from, ground_from = to_planar(T_world_from.double())
-    yaw_to, ground_to = to_planar(T_world_to.double())
+    nowhere = torch.eye(4, dtype=torch.float64, device=present.device)  # where whoever is absent may be
+    there = present[..., None, None]
+    yaw_from, ground_from = to_planar(torch.where(there, T_world_from.double(), nowhere))
+    yaw_to, ground_to = to_planar(torch.where(there, T_world_to.double(), nowhere))
     weight = present.double() / present.sum(dim=-1, keepdim=True)
     mean_from, mean_to = ((weight[..., None] * g).sum(dim=-2) for g in (ground_from, ground_to))
     # A turn about y multiplies z + ix by a complex unit, so the best one is the phase of a sum.

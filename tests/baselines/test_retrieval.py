@@ -232,6 +232,8 @@ def test_absent_agents_do_not_pull_on_the_best_move() -> None:
     b[:, 2:] = torch.eye(4, dtype=torch.float64)
     present = torch.tensor([True, True, False, False]).expand(5, 4)
     torch.testing.assert_close(best_move(a, b, present), move[:, 0], atol=1e-6, rtol=0)
+    b[:, 2:] = torch.nan
+    torch.testing.assert_close(best_move(a, b, present), move[:, 0], atol=1e-6, rtol=0)
 
 
 def test_stretches_with_masked_frames_are_never_drawn(train: Scene) -> None:
@@ -239,6 +241,16 @@ def test_stretches_with_masked_frames_are_never_drawn(train: Scene) -> None:
     valid[30:59, 3] = False
     baseline = RandomSample(train.replace(valid=valid))
     assert baseline.candidates(2).tolist() == [59]
+
+
+def test_masked_stretches_do_not_tell_how_far_numbers_spread(train: Scene) -> None:
+    valid = torch.ones(train.scenes, train.frames, dtype=torch.bool)
+    valid[::2, 3] = False
+    root = train.T_world_root.clone()
+    root[::2, 3] = torch.nan
+    context = wander(4, 2, seed=9).slice(0, CONTEXT)
+    some, spoiled = (train.replace(valid=valid), train.replace(valid=valid, T_world_root=root))
+    same(*(NearestNeighbour(each)(context, HORIZON) for each in (some, spoiled)), tolerance=0.0)
 
 
 def test_what_does_not_fit_is_named(train: Scene) -> None:
