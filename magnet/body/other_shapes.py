@@ -15,6 +15,7 @@ from magnet.body.reach import reach
 from magnet.body.repair import UPRIGHT
 from magnet.body.settle import Settle, corrected, correction
 from magnet.body.settle_wishes import Wishes
+from magnet.motion.runs import held
 from magnet.motion.scene import Scene
 
 
@@ -24,7 +25,7 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
     Hips are higher or lower as legs are longer or shorter, ankles stay where they were over the ground, then poses are
     corrected together: hands that held hold again, standing feet stay still, bodies are no deeper in each other than
     `firm` allows. Where arms are too short for it, people come nearer to each other. A scene far from y = 0 has its own
-    floor and stays there.
+    floor and stays there. Frames that are not valid hold the pose before.
 
     Args:
         scene: (B, T, P).
@@ -36,6 +37,8 @@ def with_shapes(scene: Scene, betas: Tensor, body: Body) -> Scene:
     """
     if betas.shape != scene.betas.shape:
         raise ValueError(f"betas: got {tuple(betas.shape)}, expected {tuple(scene.betas.shape)}")
+    if scene.valid is not None:  # what is not valid is no motion, and may not even be finite
+        scene = held(scene, scene.valid)
     floor = off_floor(lowest(scene, body), counting(scene))
     if floor.any():
         return _raised(with_shapes(_raised(scene, -floor), betas, body), floor)

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from magnet.motion.runs import held
 from magnet.motion.scene import Scene, require_rotations
 
 Split = Literal["train", "val", "test"]
@@ -24,7 +25,8 @@ class Clip:
     """One recording of people who share a world: 30 fps, y up, floor at height 0.
 
     Args:
-        scene: one scene (B = 1) of T frames whose agents are all present.
+        scene: one scene (B = 1) of T frames whose agents are all present. Frames that are not `valid` may be anything:
+            they come to hold the pose before.
         name: what reports call it, such as "60_05+61_05".
         source: the data set or part of it, which mixture weights refer to.
         split: train, val or test.
@@ -47,6 +49,8 @@ class Clip:
             raise ValueError(f"clip {self.name}: got (B, T, P) = {shape}, expected one scene with frames and agents")
         if not bool(self.scene.present.all()):
             raise ValueError(f"clip {self.name}: has an absent agent; a clip holds only the people who are there")
+        if self.scene.valid is not None:  # what is masked may be anything
+            object.__setattr__(self, "scene", held(self.scene, self.scene.valid))
         for field in ("body_rot", "T_world_root", "betas"):
             if not bool(getattr(self.scene, field).isfinite().all()):
                 raise ValueError(f"clip {self.name}: {field} holds NaN or infinity; mask such frames with `valid`")

@@ -73,6 +73,16 @@ def test_who_stands_far_from_the_floor_stays_there(handshake: Scene, changed: Sc
     assert float(off.mean()) < 0.005 and float(off.max()) < 0.03  # its floor is found from its lowest frames
 
 
+def test_frames_that_are_not_valid_may_be_anything(handshake: Scene) -> None:
+    few = handshake.slice(0, 30)
+    valid = (torch.arange(30) // 5 != 2)[None]
+    masked, nothing = few.replace(valid=valid), torch.tensor(torch.nan)
+    made = with_shapes(masked, ONE_EACH_WAY, BODY)
+    again = with_shapes(masked.with_poses(~valid[..., None], nothing, nothing), ONE_EACH_WAY, BODY)
+    assert torch.equal(again.T_world_root, made.T_world_root) and torch.equal(again.body_rot, made.body_rot)
+    assert torch.equal(made.valid, valid) and not torch.equal(made.body_rot[:, valid[0]], few.body_rot[:, valid[0]])
+
+
 def test_too_few_shapes_are_refused(handshake: Scene) -> None:
     with pytest.raises(ValueError, match=r"betas: got \(1, 1, 10\), expected \(1, 2, 10\)"):
         with_shapes(handshake, handshake.betas[:, :1], BODY)

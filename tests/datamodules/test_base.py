@@ -293,6 +293,9 @@ def test_bad_clips_are_refused(generator: torch.Generator) -> None:
     broken[0, 3, 1, 0, 3] = torch.nan
     with pytest.raises(ValueError, match="clip x: T_world_root holds NaN"):
         Clip(scene.replace(T_world_root=broken), "x", "s", "train")
+    valid = torch.arange(8)[None] != 3
+    masked = Clip(scene.replace(T_world_root=broken, valid=valid), "x", "s", "train").scene
+    assert torch.equal(masked.T_world_root[:, 3], scene.T_world_root[:, 2]), "what is masked may be anything"
     with pytest.raises(ValueError, match=r"clip x: T_world_root.* is no rotation \(scene 0, frame 0"):
         Clip(scene.replace(T_world_root=torch.zeros_like(scene.T_world_root)), "x", "s", "train")
     with pytest.raises(ValueError, match="clip x: has an absent agent"):

@@ -3,8 +3,10 @@ from __future__ import annotations
 import itertools
 
 import pytest
+import torch
 
-from magnet.motion.runs import true_runs
+from magnet.motion.runs import held, true_runs
+from magnet.testing import random_scene
 
 
 @pytest.mark.parametrize("least", [1, 2, 3])
@@ -21,3 +23,13 @@ def test_runs_are_those_that_a_walk_over_the_mask_finds(least: int):
 
 def test_an_empty_mask_has_no_runs():
     assert true_runs([]) == []
+
+
+def test_the_last_good_pose_is_held_and_at_the_beginning_the_first():
+    scene = random_scene(2, 5, 2, torch.Generator().manual_seed(1))
+    good = torch.tensor([[False, False, True, False, True], [True, False, False, True, False]])
+    made = held(scene, good)
+    for b, taken in enumerate(([2, 2, 2, 2, 4], [0, 0, 0, 3, 3])):
+        assert torch.equal(made.body_rot[b], scene.body_rot[b, taken])
+        assert torch.equal(made.T_world_root[b], scene.T_world_root[b, taken])
+    assert held(scene, torch.ones_like(good)) is scene
