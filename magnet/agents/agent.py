@@ -145,7 +145,8 @@ class Notebook:
         return max(map(self.last, self.others()), default=-1)
 
     def others(self) -> list[int]:
-        return [slot for slot in range(len(self.names)) if slot != self.me]
+        """The slots of everybody else who is in the start scene."""
+        return [slot for slot in self.start.present[0].nonzero()[:, 0].tolist() if slot != self.me]
 
     def told(self, slot: int, index: int) -> Message:
         """A token as it is told, of oneself or of another."""

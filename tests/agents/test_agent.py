@@ -224,6 +224,17 @@ def test_who_joins_behind_somebody_of_whom_nothing_else_is_kept_holds_them_there
     assert agent.next == 70 and np.isfinite(agent.step().poses).all()
 
 
+def test_a_free_slot_may_hold_anything_and_is_heard_of_by_nobody(denoiser, start):
+    free = start.replace(present=torch.tensor([[True, True, False]]))
+    nothing, made = torch.tensor(torch.nan), []
+    for scene in (free, free.with_poses(~free.present[:, None], nothing, nothing)):
+        two = [Agent(denoiser, scene, NAMES, name, AgenticAsync(), REFERENCE, seed=1) for name in NAMES[:2]]
+        told = [one.step() for _ in range(4) for one in two]
+        made.append(np.concatenate([each.poses for each in told]))
+        assert two[0].others() == [1]
+    assert np.isfinite(made[0]).all() and np.array_equal(*made)
+
+
 def test_what_cannot_be_is_named(denoiser, start):
     with pytest.raises(ValueError, match="a name for each slot"):
         Agent(denoiser, start, ("A", "B"), "A", AgenticSync())
