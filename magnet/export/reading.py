@@ -161,7 +161,8 @@ def _grounded(scene: Scene, body: Body, notes: Sequence[str], foreign: Sequence[
     """
     if any(foreign) and (all(foreign) or level(scene, body)):
         moved = on_floor(scene, body)
-        metres = float((scene.T_world_root - moved.T_world_root)[..., 1, 3].mean()) if scene.T_world_root.numel() else 0
+        down = (scene.T_world_root - moved.T_world_root)[..., 1, 3].transpose(1, 2)[scene.present]
+        metres = float(down.mean()) if down.numel() else 0
         if abs(metres) >= UNSEEN:
             way = "lowered" if metres > 0 else "raised"
             far = f"{100 * abs(metres):.1f} cm" if abs(metres) < 1 else f"{abs(metres):.2f} m"

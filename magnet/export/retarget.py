@@ -149,7 +149,9 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any)
     scene = together(people, names, fps=options.fps, trim=options.trim)
     floor = 0.0
     if not options.keep_floor and not all(source.exact for _, source in read):
-        floor = float(floor_height(body.joints(scene)[0], body, scene.betas[0]).amin(dim=-1).median())
+        soles = floor_height(body.joints(scene)[0], body, scene.betas[0]).amin(dim=-1)
+        seen = None if scene.valid is None or not bool(scene.valid.any()) else scene.valid[0]
+        floor = float((soles if seen is None else soles[seen]).median())
         T_world_root = scene.T_world_root.clone()
         T_world_root[..., 1, 3] -= floor
         scene = scene.replace(T_world_root=T_world_root)

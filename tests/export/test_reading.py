@@ -172,6 +172,18 @@ def test_another_programs_people_are_put_on_the_floor_from_any_height(off: float
     assert any(f"{'lowered' if moved > 0 else 'raised'} by {100 * abs(moved):.1f} cm" in note for note in got.notes)
 
 
+def test_how_far_people_were_moved_is_told_of_those_who_are_there(duet: Scene, body: Body, tmp_path: Path) -> None:
+    """Beside a file of ours with free slots, whose nobody is not moved."""
+    alone = duet.permute_agents(torch.tensor([0]))
+    theirs = upstairs(alone, tmp_path / "theirs.npz", body, ours=False)
+    root = alone.T_world_root.clone()
+    root[..., 1, 3] += 2.0
+    ours = alone.replace(T_world_root=root).pad_agents(3).save(tmp_path / "ours.npz")
+    got, kept = (reading.read([theirs, ours], options=reading.Reading(keep_floor=keep)) for keep in (False, True))
+    moved = float((kept.scene.T_world_root - got.scene.T_world_root)[0, 0, 0, 1, 3])
+    assert moved > 1.5 and any(f"lowered by {moved:.2f} m" in note for note in got.notes)
+
+
 def test_whoever_stands_on_the_floor_is_not_spoken_of(duet: Scene, body: Body, tmp_path: Path):
     for name, smplx in (("a.npz", False), ("b.npz", True), ("c.bvh", False)):
         notes = reading.read(formats.write(duet, tmp_path / name, body, smplx=smplx)).notes

@@ -121,6 +121,15 @@ def test_a_person_comes_back_from_any_rig(case, truth: Truth, body: Body, tmp_pa
     assert angle[LIMBS].max() < 12 and angle.mean() < 7
 
 
+def test_whoever_was_lost_in_the_air_is_not_put_on_the_floor_there(truth: Truth, body: Body, tmp_path: Path):
+    path = stranger(truth, body, tmp_path / "stranger.bvh")
+    whole, lines = load_rigs(path, body, end=5).floor, path.read_text().splitlines()
+    x, y, *rest = lines[-12].split()  # of 16 frames the fifth
+    lines[-12:] = [" ".join([x, str(float(y) + 0.5), *rest]), *[" ".join(["nan"] * (len(rest) + 2))] * 11]
+    path.write_text("\n".join(lines) + "\n")
+    assert load_rigs(path, body).floor == pytest.approx(whole, abs=0.03)
+
+
 def person(
     truth: Truth, body: Body, path: Path, about: float = 0.0, walk: float = 0.0, bones: float = 1.0, **how
 ) -> Path:
