@@ -184,7 +184,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         speed=given.speed,
     )
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell that began it in the background ignores them
+        for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell began it in the background, ignoring them
             signal.signal(number, signal.default_int_handler)
     print(f"magnet agent: {given.name} is at {given.listen}   (Ctrl+C ends it)", file=sys.stderr, flush=True)
     with contextlib.suppress(KeyboardInterrupt):
