@@ -103,7 +103,8 @@ def columns(number: int) -> Iterator[None]:
 
 def place() -> Path | None:
     """The file of all answers of this code; None where the code cannot be told, as with tasks out of a variable."""
-    return None if os.environ.get(VARIABLE) else folder() / f"answers-{code_digest()}.json"
+    cache = folder()
+    return None if cache is None or os.environ.get(VARIABLE) else cache / f"answers-{code_digest()}.json"
 
 
 def shipped() -> Path | None:
@@ -111,9 +112,12 @@ def shipped() -> Path | None:
     return None if os.environ.get(VARIABLE) else OURS / "cli" / f"answers-{code_digest()}.json"
 
 
-def folder() -> Path:
-    """Where everything is kept."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
+def folder() -> Path | None:
+    """Where everything is kept; None for a user without a home, such as one that a container knows by number alone."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "magnet"
+    except RuntimeError:
+        return None
 
 
 @functools.cache

@@ -218,10 +218,17 @@ def files() -> Iterator[Finding]:
         else:
             yield Finding("files", f"model {name}", "ok", f"{folder}, {size:.0f} MB, every hash right")
     yield _recordings()
-    cache = answers.folder()
-    kept = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) / 1e6 if cache.is_dir() else 0.0
-    yield Finding("files", "cache", "ok", f"{cache}, {kept:.0f} MB; it may be deleted")
+    yield _cache()
     yield _runs(Path("runs"))
+
+
+def _cache() -> Finding:
+    """Where help and fitted recordings are kept."""
+    cache = answers.folder()
+    if cache is None:
+        return Finding("files", "cache", "missing", "this user has no home folder", "set HOME or XDG_CACHE_HOME")
+    kept = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) / 1e6 if cache.is_dir() else 0.0
+    return Finding("files", "cache", "ok", f"{cache}, {kept:.0f} MB; it may be deleted")
 
 
 def _recordings() -> Finding:

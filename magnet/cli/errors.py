@@ -50,6 +50,8 @@ def explain(error: Exception) -> str | None:
             "another process of this training has ended, and so does this one; its own log says why. To go on from "
             "the last checkpoint, run the same command with --ckpt_path last (--debug shows where)"
         )
+    if isinstance(error, RuntimeError) and "determine home directory" in text:  # Python's
+        return "this user has no home folder: set HOME, or give folders in full; a cache of fits by --data.cache"
     if isinstance(error, RuntimeError) and "--ntasks-per-node" in text:  # Lightning's, of SLURM
         return f"{text} Or start one process alone, by srun --ntasks=1."
     if isinstance(error, RuntimeError) and text.startswith("Early stopping conditioned on metric"):  # Lightning's

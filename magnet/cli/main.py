@@ -16,7 +16,7 @@ from typing import Any
 from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
 from magnet.cli.named_files import unquoted
-from magnet.cli.pipes import CLOSED, output_closed, take_any_letter
+from magnet.cli.pipes import CLOSED, output_closed, replace_closed, take_any_letter
 from magnet.cli.run_numbers import too_large
 from magnet.errors import Stopped
 from magnet.version import __version__
@@ -73,6 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns the exit code: 0, 2 where the user can put it right, or 141 where its output was closed before the end.
     """
+    replace_closed()
     take_any_letter(sys.stdout, sys.stderr)
     if arguments is None and not wants_traces(sys.argv[1:]):  # of a process that is nobody else's
         warnings.showwarning = warn_in_a_line

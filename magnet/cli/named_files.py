@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from os.path import exists  # Path's fails at words that are too long for a name
 from pathlib import Path
 
 from magnet.cli.errors import CommandError
@@ -18,11 +19,11 @@ QUOTES = "a path with spaces needs quotes"
 def unquoted(arguments: Sequence[str]) -> str:
     """The end of an error's sentence where neighbouring words together are a path that is there; else nothing."""
     for words in runs(arguments):
-        there = [Path(word).exists() for word in words]
+        there = [exists(word) for word in words]
         for first in range(len(words)):
             for stop in range(first + 2, min(first + MOST_PIECES, len(words)) + 1):
                 whole = " ".join(words[first:stop])
-                if not all(there[first:stop]) and Path(whole).exists():
+                if not all(there[first:stop]) and exists(whole):
                     return f'; {whole} is there: {QUOTES}, "{whole}"'
     return ""
 
@@ -41,9 +42,9 @@ def runs(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 def require_there(paths: Sequence[str]) -> None:
     """Refuse files to read that are not there; of those of other kinds the reader says what it reads."""
-    missing = [path for path in paths if not Path(path).exists() and Path(path).suffix.lower() in (*READ, "")]
+    missing = [path for path in paths if not exists(path) and Path(path).suffix.lower() in (*READ, "")]
     if missing:
-        pieces = any(not Path(path).exists() and Path(path).suffix.lower() not in READ for path in paths)
+        pieces = any(not exists(path) and Path(path).suffix.lower() not in READ for path in paths)
         hint = f"; {QUOTES}" if pieces and len(paths) > 1 and not unquoted(paths) else ""
         raise CommandError(f"{missing[0]}: no such file{hint}")
 

@@ -12,6 +12,13 @@ CLOSED = 141
 """The exit code of a command that stopped because its output was closed: 128 + SIGPIPE."""
 
 
+def replace_closed() -> None:
+    """Let what is written to outputs that were closed at the start go nowhere: Python has None in their place."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, io.TextIOWrapper(io.FileIO(os.devnull, "w"), encoding="utf-8"))
+
+
 def take_any_letter(*streams: object) -> None:
     """Write a question mark for letters that a stream does not know, such as arrows in a file on Windows."""
     for stream in streams:

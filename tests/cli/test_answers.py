@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from magnet.cli import answers, flags
+from magnet.cli import answers, doctor, flags
+from magnet.cli.errors import explain
 from magnet.cli.main import LIGHT_COMMANDS, TRAINER_COMMANDS
+from magnet.datamodules.preparing.fit_cache import cache_folder
 
 HEAVY = {"torch", "lightning", "jsonargparse", "numpy"}
 RUN = "import sys; from magnet.cli import main; code = main(sys.argv[1:]); print('\\n#', code, *sys.modules)"
@@ -132,6 +134,24 @@ def test_a_place_that_cannot_be_written_is_no_error(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     monkeypatch.setattr(answers, "FRESH", True)
     assert answers.kept("a", lambda: "one") == "one"
+
+
+def test_a_user_without_a_home_folder_is_answered_and_told_where_one_is_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in a container whose user is a number alone."""
+
+    def none() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", none)
+    monkeypatch.setattr(answers, "FRESH", True)
+    assert answers.kept("a", lambda: "one") == "one"
+    assert [found.state for found in doctor.files() if found.what == "cache"] == ["missing"]
+    with pytest.raises(RuntimeError) as error:
+        cache_folder(None, "cmu")
+    assert "no home folder: set HOME" in (explain(error.value) or "")
 
 
 KNOWN = {

@@ -59,3 +59,11 @@ def test_words_that_are_files_themselves_need_no_quotes(folder: Path) -> None:
     (folder / "one.npz my dance.npz").touch()
     assert unquoted(["one.npz", "my dance.npz"]) == "" == unquoted(["--out", "none.npz", "--trim", "my"])
     assert unquoted(["one.npz", "my", "dance.npz", "--trim"]) != ""
+
+
+def test_words_that_together_are_longer_than_a_name_may_be_do_not_hide_a_mistake(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    takes = [f"{'take' * 20}{number}.npz" for number in range(4)]
+    assert cli.main(["predict", *takes, "--out", "o.glb"]) == 2
+    assert f"{takes[0]}: no such file" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +77,13 @@ def test_a_run_goes_on_where_nobody_reads_its_progress(monkeypatch: pytest.Monke
             lines.tell("test: denoising step", done, 3)
         print("the table", flush=True)
         assert not output_closed()  # it leads nowhere now
+
+
+def test_a_table_is_written_where_no_output_is_open(tmp_path: Path) -> None:
+    closed = f"exec {shlex.quote(sys.executable)} -c {shlex.quote(SHOWS)} >&- 2>&- <&-"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    assert subprocess.run(["sh", "-c", closed], cwd=tmp_path, env=environment, timeout=120).returncode == 0
+    assert (tmp_path / "out" / "results.json").exists()
 
 
 def test_letters_that_a_stream_does_not_know_are_question_marks() -> None:
