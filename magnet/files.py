@@ -14,7 +14,7 @@ import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -70,7 +70,8 @@ def _about(error: OSError, path: Path) -> bool:
     """Whether an error is about a path, its folders or its content, and not about another file."""
     if not isinstance(error.filename, str | bytes | os.PathLike):
         return True
-    named = Path(os.fsdecode(error.filename))
+    # Locks are named in full, and no ".." may hide that two paths are one.
+    named, path = (Path(os.path.abspath(os.fsdecode(each))) for each in (error.filename, path))
     return named.is_relative_to(path) or path.is_relative_to(named)
 
 
@@ -250,29 +251,36 @@ class Taken(OSError):
 def alone(lock: Path, taken: str) -> Iterator[None]:
     """Hold a lock meanwhile, which goes with the process, however it ends. taken: the message where another has it
 
+    Some network file systems have no locks: there nobody is kept out.
+
     Raises:
         Taken: another process has it.
     """
     from filelock import FileLock, Timeout  # brings asyncio, which the first words of a command need not wait for
 
     try:
-        held = FileLock(lock, timeout=0).acquire()
+        held: AbstractContextManager[object] = FileLock(lock, timeout=0).acquire()
     except Timeout as error:
         raise Taken(taken) from error
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):
+            raise
+        held = nullcontext()
     with held:
         yield
 
 
-def sync(path: Path) -> None:
-    """Write a file, or the renames in a folder, to the disk."""
+def sync(folder: Path) -> None:
+    """Write the renames in a folder to the disk, where it takes that: Windows opens no folder, and needs none."""
     try:
-        handle = os.open(path, os.O_RDONLY)
+        handle = os.open(folder, os.O_RDONLY)
     except PermissionError:
-        if path.is_dir():  # which Windows does not open, and whose renames it keeps by itself
-            return
-        raise
+        return
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # of network file systems that sync no folders
+            raise
     finally:
         os.close(handle)
 

@@ -7,6 +7,7 @@ import hashlib
 import os
 import re
 import resource
+import stat
 import struct
 import zipfile
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from magnet.export.npz import read_smplx
 from magnet.export.trace import DenoisingTrace
 from magnet.files import (
     CannotWrite,
+    alone,
     inside,
     load_npz,
     npz_path,
@@ -134,6 +136,39 @@ def _failing(write):  # type: ignore[no-untyped-def]
         return write(self, data)
 
     return begin
+
+
+def test_a_network_file_system_that_syncs_no_folders_and_has_no_locks_is_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fcntl, fsync = pytest.importorskip("fcntl"), os.fsync
+
+    def files_alone(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(handle)
+
+    def none(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(os, "fsync", files_alone)
+    monkeypatch.setattr(fcntl, "flock", none)
+    with alone(tmp_path / "lock", "taken"):
+        assert write_whole(tmp_path, "a", b"new")[0] == "a"
+    assert (tmp_path / "a").read_bytes() == b"new"
+
+
+def test_a_refused_file_is_told_of_by_the_folder_that_it_belongs_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    refused = OSError(errno.EROFS, "Read-only file system", str(tmp_path / "out" / ".prepare" / "lock"))
+    with (
+        pytest.raises(CannotWrite, match="cannot be written"),
+        writing("../out", "choose another --out"),
+    ):
+        raise refused
 
 
 def test_a_file_takes_its_place_when_it_is_whole(tmp_path: Path) -> None:

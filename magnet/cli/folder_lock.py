@@ -1,4 +1,4 @@
-"""A training has its folder to itself: another one there, running or finished, is not overwritten."""
+"""A training has its folder to itself, and so has a report: what is there, running or finished, is not overwritten."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ LOCK = ".training.lock"
 
 
 @contextlib.contextmanager
-def held(folder: Path) -> Iterator[None]:
+def held(folder: Path, what: str = "training") -> Iterator[None]:
     """Hold the folder's lock meanwhile; other processes of the same training leave it to the first one.
 
-    The lock goes with the process, however it ends. Where no lock can be had, the training runs without: a folder that
+    The lock goes with the process, however it ends. Where no lock can be had, the work is done without: a folder that
     cannot be written is told of later, and some network file systems have no locks.
+
+    Args:
+        folder: made if missing.
+        what: works there, for the message.
     """
     if not first_process():
         yield
@@ -38,7 +42,7 @@ def held(folder: Path) -> Iterator[None]:
             except Taken as error:
                 lock.pop_all()
                 raise CommandError(
-                    f"another training is working in {folder}; wait for it, or choose another --out"
+                    f"another {what} is working in {folder}; wait for it, or choose another --out"
                 ) from error
         yield
 

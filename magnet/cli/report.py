@@ -51,9 +51,11 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] = ()) -> int:
     """Run the command. Returns the exit code: 1 where a cell could not be done."""
     given = parser().parse_args(list(arguments))
+    from magnet.cli import folder_lock
     from magnet.cli.provenance import machine, provenance
     from magnet.cli.quiet import quiet
     from magnet.cli.train import run_trainer
+    from magnet.files import require_place
     from magnet.report.cells import BUDGETS, Store
     from magnet.report.page import page
     from magnet.report.plan import ReportOptions
@@ -89,7 +91,9 @@ def main(arguments: Sequence[str] = ()) -> int:
         print(f"{len(wanted)} cells, {len(wanted) - len(todo)} done; the other {len(todo)} may take {total}{how}")
         return 0
     if not given.page_only:
-        runner.run(wanted)
+        require_place(given.out / "report.json")
+        with folder_lock.held(given.out, "report"):  # another one would begin the same trainings anew
+            runner.run(wanted)
     facts = {"tables": ", ".join(names), "budget": f"{given.budget}: {plan.budget.told}", "data": given.data}
     facts |= {"checkpoint": given.ckpt_path, **provenance(), "machine": machine()}
     written = page(blocks, store, runner.failed, facts)

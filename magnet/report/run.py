@@ -11,6 +11,7 @@ from pathlib import Path
 
 import yaml
 
+from magnet.files import CannotWrite
 from magnet.report import measure
 from magnet.report.cells import Cell, Store
 from magnet.report.plan import extended
@@ -89,6 +90,8 @@ class Runner:
                 continue
             try:
                 self._run(cell)
+            except CannotWrite:  # nor could what others give
+                raise
             except (ValueError, OSError, ImportError, RuntimeError) as error:
                 self.failed[cell] = " ".join(str(error).split())
                 self.say(f"  not done: {self.failed[cell]}")
