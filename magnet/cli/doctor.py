@@ -233,12 +233,14 @@ def _cache() -> Finding:
 
 def _recordings() -> Finding:
     """CMU's recordings, which are the only ones that a variable names."""
+    from magnet.datamodules.reading.fields import files_under
+
     said = os.environ.get("MAGNET_CMU")
     if not said:
         advice = "magnet data download cmu FOLDER, then export MAGNET_CMU=FOLDER; nothing but training on them needs it"
         return Finding("files", "CMU", "missing", "MAGNET_CMU is not set", advice)
     folder = Path(said).expanduser()
-    takes = sum(1 for path in folder.rglob("*") if path.suffix.lower() == ".amc") if folder.is_dir() else 0
+    takes = sum(1 for path in files_under(folder) if path.suffix.lower() == ".amc")
     if not takes:
         return Finding("files", "CMU", "wrong", f"MAGNET_CMU is {said}, which holds no .amc", "set it to the folder")
     return Finding("files", "CMU", "ok", f"{folder}, {takes} recordings")

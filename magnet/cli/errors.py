@@ -68,6 +68,9 @@ def explain(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in FULL and error.args[:1] == (error.errno,):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}the disk is full: free some space, then run the same command again (--debug shows where)"
+    if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
+        around = error.object[max(error.start - 30, 0) : error.end + 10]
+        return f"the name of a file or folder is not UTF-8, here in {around!a}: rename it (--debug shows where)"
     if isinstance(error, (ValueError, OSError)) or type(error).__name__ == "MisconfigurationException":
         said = re.findall(r"^ *- (?!Expected )(.+)", text, re.MULTILINE) if text.startswith(UNION) else []
         return f"{said[0] if said else text or type(error).__name__} (--debug shows where)"

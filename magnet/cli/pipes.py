@@ -20,9 +20,14 @@ def replace_closed() -> None:
 
 
 def take_any_letter(*streams: object) -> None:
-    """Write a question mark for letters that a stream does not know, such as arrows in a file on Windows."""
+    """Write a question mark for letters that a stream does not know, such as arrows in a file on Windows.
+
+    UTF-8 knows all but the bytes in names of files that are of no encoding.
+    """
     for stream in streams:
-        if isinstance(stream, io.TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
+        if not isinstance(stream, io.TextIOWrapper):
+            continue
+        if stream.errors == "strict" or not stream.encoding.lower().startswith("utf"):
             stream.reconfigure(errors="replace")
 
 

@@ -18,7 +18,7 @@ from magnet.datamodules.preparing.fit_cache import FitCache, Steps, cache_folder
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import Glitches, check_rate, measured
 from magnet.datamodules.reading.cmu_subjects import RATES, USUAL_RATE, couple_of
-from magnet.datamodules.reading.fields import listing
+from magnet.datamodules.reading.fields import files_under, listing
 from magnet.datamodules.reading.recording import DataError, Reader, Recording, Take
 from magnet.datamodules.registry import register_data
 from magnet.datamodules.store.memory import MemoryStore
@@ -126,7 +126,7 @@ class CMUReader(Reader):
     def _files(self) -> dict[str, Path]:
         """Skeletons and takes by name in lower case."""
         files: dict[str, Path] = {}
-        for path in sorted(self.root.rglob("*")):
+        for path in sorted(files_under(self.root)):
             if path.suffix.lower() not in (".asf", ".amc"):
                 continue
             other = files.setdefault(path.name.lower(), path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from magnet import checkpoints, cli
+from magnet.cli.errors import explain
 from magnet.cli.named_files import unquoted
 
 QUOTES = '; my dance.npz is there: a path with spaces needs quotes, "my dance.npz"'
@@ -67,3 +68,11 @@ def test_words_that_together_are_longer_than_a_name_may_be_do_not_hide_a_mistake
     takes = [f"{'take' * 20}{number}.npz" for number in range(4)]
     assert cli.main(["predict", *takes, "--out", "o.glb"]) == 2
     assert f"{takes[0]}: no such file" in capsys.readouterr().err
+
+
+def test_a_name_that_no_file_of_text_takes_is_shown_where_it_stands() -> None:
+    """As of archives that were packed on Windows: bytes that are no UTF-8."""
+    with pytest.raises(UnicodeEncodeError) as error:
+        '"take": "\udc81bung_A", "split": "train"'.encode()
+    said = explain(error.value) or ""
+    assert said.startswith("the name of a file or folder is not UTF-8, here in ") and r"\udc81bung_A" in said

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,23 @@ def _folders(root: Path, parts: Sequence[str]) -> list[Path]:
         return [root]
     named = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name.casefold() == parts[0].casefold()]
     return [folder for path in named for folder in _folders(path, parts[1:])]
+
+
+def files_under(root: Path) -> Iterator[Path]:
+    """All files under a folder, and under those that links in it lead to; no folder twice, so that no link goes round.
+
+    A link that leads nowhere counts as a file, which whoever reads it finds missing.
+    """
+    seen: set[str] = set()
+    starts = [str(root)]  # links come last: what lies in the folder itself keeps its name
+    for start in starts:
+        for folder, below, names in os.walk(start):
+            if (place := os.path.realpath(folder)) in seen:
+                below.clear()
+                continue
+            seen.add(place)
+            starts += sorted(path for name in below if os.path.islink(path := os.path.join(folder, name)))
+            yield from (Path(folder, name) for name in names)
 
 
 def listing(folder: Path, most: int = 8) -> str:

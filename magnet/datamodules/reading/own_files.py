@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from magnet.datamodules.reading.fields import natural
+from magnet.datamodules.reading.fields import files_under, natural
 from magnet.datamodules.reading.recording import DataError
 from magnet.export.unread import ADVICE, advice_for
 from magnet.files import said_sign
@@ -67,9 +67,9 @@ def files_of(root: Path, suffixes: Sequence[str]) -> list[Path]:
     """All files of these suffixes under a folder, take 10 after take 9; hidden ones are left out."""
     found = [
         path
-        for path in root.rglob("*")
+        for path in files_under(root)
         if path.suffix.lower() in suffixes
-        and path.is_file()
+        and (path.is_file() or not path.exists())
         and not any(part.startswith(".") for part in path.relative_to(root).parts)
     ]
     return sorted(found, key=lambda path: (natural(path.relative_to(root).as_posix()), path.as_posix()))

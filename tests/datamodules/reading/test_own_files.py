@@ -120,3 +120,17 @@ def test_what_is_wrong_with_a_table_is_said_with_its_line(text: str, message: st
     with pytest.raises(DataError, match=message) as caught:
         by_table(tmp_path, tmp_path / "mine.csv", (".bvh",))
     assert "mine.csv" in str(caught.value)
+
+
+def test_links_are_followed_once_and_one_that_leads_nowhere_is_a_file_that_is_missed(tmp_path: Path) -> None:
+    """A disk that is not there today: one of a couple would be a person alone, and a take would be gone unsaid."""
+    root, disk = tmp_path / "root", tmp_path / "disk"
+    made(root, "walk_A.bvh", ".hidden_A.bvh", "z/own.bvh")
+    made(disk, "day/dance.bvh")
+    (root / "walk_B.bvh").symlink_to("/nowhere/walk_B.bvh")
+    for name, leads in {"a": disk / "day", "b": disk, "again": root / "z", "up": root, "z/loop": root / "z"}.items():
+        (root / name).symlink_to(leads)
+    files = files_of(root, (".bvh",))
+    names = [path.relative_to(root).as_posix() for path in files]
+    assert names == ["a/dance.bvh", "walk_A.bvh", "walk_B.bvh", "z/own.bvh"]
+    assert told(by_names(root, files))["walk"] == ["A", "B"]
