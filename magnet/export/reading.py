@@ -65,9 +65,9 @@ def read(
         names = ", ".join(file.name or str(file) for file in files) or "nothing"
         also = sorted(suffixes & {*WRITTEN, ".usd"} - set(READ))
         only = f"; {', '.join(also)} can be written but not read: keep an .npz of the scene beside it" if also else ""
-        rigs = ", ".join(RIGS)
+        arrays, rigs = f"{', '.join(ARRAYS[:-1])} and {ARRAYS[-1]}", ", ".join(RIGS)
         raise ValueError(
-            f"cannot read {names}: expected {', '.join(ARRAYS)}, or {TABLE} files alone, or files of skeletons "
+            f"cannot read {names}: expected {arrays}, or {TABLE} files alone, or files of skeletons "
             f"({rigs}){only}{advice_for(suffixes)}"
         )
     for file in files:

@@ -368,7 +368,7 @@ def test_a_folder_of_ones_own_is_recognised_by_its_files_and_a_wrong_table_is_na
     (tmp_path / "dl/people.csv").unlink()
     (tmp_path / "dl/more.bvh").touch()
     assert cli.main(words) == 2
-    said = "could be bvh or scenes: say which with --name; bvh reads .bvh and scenes reads .npz and .pkl alone"
+    said = "could be bvh or scenes: say which with --name; bvh reads .bvh and scenes reads .npz, .pkl and .pt alone"
     assert said in capsys.readouterr().err
 
 

@@ -172,7 +172,7 @@ WRONG = {
     ("duet.npz", "out.glb", "--scene", "7"): "--scene 7: the file has scenes 0 to 1",
     ("broken.bvh", "out.npz"): "not a BVH file",
     ("duet.npz", "out.glb", "--body", "none.npz"): "none.npz: no such body file",
-    ("duet.npz", "broken.bvh", "out.glb"): "expected .npz and .pkl, or .csv files alone, or files of skeletons",
+    ("duet.npz", "broken.bvh", "out.glb"): "expected .npz, .pkl and .pt, or .csv files alone, or files of skeletons",
 }
 
 

@@ -337,11 +337,11 @@ def test_files_may_stand_behind_options() -> None:
     ("words", "message"),
     [
         (["none.npz"], "none.npz: no such file"),
-        (["OURS", "none.txt"], "expected .npz and .pkl, or .csv files alone, or files of skeletons"),
+        (["OURS", "none.txt"], "expected .npz, .pkl and .pt, or .csv files alone, or files of skeletons"),
         (["OURS", "--people", "1"], "--people 1: expected at least 2"),
         (
             ["motion.usdz"],
-            "cannot read motion.usdz: expected .npz and .pkl, or .csv files alone, or files of skeletons",
+            "cannot read motion.usdz: expected .npz, .pkl and .pt, or .csv files alone, or files of skeletons",
         ),
         (["OURS", "--task", "joint_futur"], "did you mean joint_future?"),
         (["OURS", "--style", "light"], "--style: is for .html, .png, .mp4, .gif, .webp, and does nothing in .npz"),

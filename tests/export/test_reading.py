@@ -93,7 +93,7 @@ def test_what_cannot_be_read_is_named(duet: Scene, body: Body, tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"b\.npz: no such file"):
         reading.read(tmp_path / "b.npz")
     for paths in ([], ["a.usdz"], ["a.npz", "b.bvh"], ["a.glb", "b.npz"]):
-        with pytest.raises(ValueError, match=r"expected \.npz, \.pkl, \.pt, or \.csv files alone, or files of skel"):
+        with pytest.raises(ValueError, match=r"expected \.npz, \.pkl and \.pt, or \.csv files alone, or files of skel"):
             reading.read(paths)
     formats.write(duet.repeat(2), tmp_path / "two.npz", body)
     with pytest.raises(ValueError, match="holds 2 scenes; several files are several people"):
