@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from os.path import exists  # Path's fails at words that are too long for a name
+from os.path import exists  # Path's fails at words that are too long for a name, or in a folder that is locked
 from pathlib import Path
 
 from magnet.cli.errors import CommandError
@@ -42,9 +42,9 @@ def runs(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 def require_there(paths: Sequence[str]) -> None:
     """Refuse files to read that are not there; of those of other kinds the reader says what it reads."""
-    missing = [path for path in paths if not exists(path) and Path(path).suffix.lower() in (*READ, "")]
+    missing = [path for path in paths if not Path(path).exists() and Path(path).suffix.lower() in (*READ, "")]
     if missing:
-        pieces = any(not exists(path) and Path(path).suffix.lower() not in READ for path in paths)
+        pieces = any(not Path(path).exists() and Path(path).suffix.lower() not in READ for path in paths)
         hint = f"; {QUOTES}" if pieces and len(paths) > 1 and not unquoted(paths) else ""
         raise CommandError(f"{missing[0]}: no such file{hint}")
 

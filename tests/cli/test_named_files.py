@@ -68,6 +68,8 @@ def test_words_that_together_are_longer_than_a_name_may_be_do_not_hide_a_mistake
     takes = [f"{'take' * 20}{number}.npz" for number in range(4)]
     assert cli.main(["predict", *takes, "--out", "o.glb"]) == 2
     assert f"{takes[0]}: no such file" in capsys.readouterr().err
+    assert cli.main(["export", "x" * 300, "o.glb"]) == 2
+    assert "File name too long" in capsys.readouterr().err
 
 
 def test_a_name_that_no_file_of_text_takes_is_shown_where_it_stands() -> None:
