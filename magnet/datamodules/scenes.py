@@ -68,8 +68,7 @@ class ScenesReader(OwnReader[PosedTrack]):
     suffixes: ClassVar[tuple[str, ...]] = (".npz", *PICKLED)
     layout: ClassVar[tuple[tuple[str, str], ...]] = (
         ("NAME_{A,B}.npz", "a person each, of SMPL's family; other ways to say who is together are in docs/own.md"),
-        ("NAME.pkl", "the same of one or several people, such as {person1: {poses, trans, betas}}; joblib's, too"),
-        ("NAME.pt", "the same as torch saved it, such as GVHMR's hmr4d_results.pt"),
+        ("NAME.pkl", "the same of one or several people, such as {person1: {poses, trans, betas}}; or .pt"),
         ("NAME.npz", "a scene that magnet wrote, or several people in one file"),
     )
     one_person_a_file: ClassVar[bool] = False
