@@ -251,7 +251,9 @@ class Taken(OSError):
 def alone(lock: Path, taken: str) -> Iterator[None]:
     """Hold a lock meanwhile, which goes with the process, however it ends. taken: the message where another has it
 
-    Some network file systems have no locks: there nobody is kept out.
+    Its file is removed while it is held, for once it is let go, another process may hold that very file. One that has
+    opened it by now is not let in by a file without a name: filelock looks (3.29.5 and later). Some network file
+    systems have no locks: there nobody is kept out.
 
     Raises:
         Taken: another process has it.
@@ -267,7 +269,11 @@ def alone(lock: Path, taken: str) -> Iterator[None]:
             raise
         held = nullcontext()
     with held:
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # on Windows filelock removes it as it lets go
+                lock.unlink()
 
 
 def sync(folder: Path) -> None:

@@ -36,7 +36,6 @@ def held(folder: Path, what: str = "training") -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             try:
                 lock.enter_context(alone(folder / LOCK, ""))
-                lock.callback(_remove, folder / LOCK)
                 for half in (folder / "checkpoints").glob(".new-*"):  # of a process that was killed as it wrote
                     half.unlink()
             except Taken as error:
@@ -45,16 +44,6 @@ def held(folder: Path, what: str = "training") -> Iterator[None]:
                     f"another {what} is working in {folder}; wait for it, or choose another --out"
                 ) from error
         yield
-
-
-def _remove(lock: Path) -> None:
-    """Remove a lock's file while it is held, for once it is let go, another training may hold that very file.
-
-    One that has opened it by now is not let in by a file without a name: filelock looks (3.29.5 and later, which
-    remove no file of others either).
-    """
-    with contextlib.suppress(OSError):  # on Windows filelock removes it as it lets go
-        lock.unlink()
 
 
 def _leave(made: list[Path]) -> None:

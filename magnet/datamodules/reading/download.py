@@ -9,7 +9,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from email.message import Message
 from importlib import resources
@@ -17,11 +17,12 @@ from pathlib import Path
 
 from magnet.datamodules.reading.cmu_subjects import folder_of
 from magnet.errors import counted
-from magnet.files import file_hash, write_whole
+from magnet.files import alone, file_hash, write_whole
 
 SITE = "http://mocap.cs.cmu.edu"  # plain: the site's certificate chain is incomplete
 MOST_SUBJECTS = 20
 MANIFEST = "manifest.sha256"
+LOCK = ".download.lock"
 CHUNK = 1 << 16
 EDGE = 2000
 """Lines at either end of a file that are looked at; a skeleton has fewer, a frame 30."""
@@ -92,12 +93,21 @@ def download_cmu(
     Raises:
         ValueError: no subject, too many, or an address that is not http.
         DownloadError: the site cannot be reached, a file is not there or never whole, or not the one that is known.
+        Taken: another download works in the folder: both would add to one file.
     """
     numbers = _numbers(subjects)
     if urllib.parse.urlsplit(base_url).scheme not in ("http", "https"):
         raise ValueError(f"base_url: got {base_url!r}, expected an address that begins with http:// or https://")
     base_url, folder, retries = base_url.rstrip("/"), Path(out).expanduser(), retries or Retries()
     folder.mkdir(parents=True, exist_ok=True)
+    busy = f"another download is working in {folder}; wait for it, or choose another folder"
+    with alone(folder / LOCK, busy):
+        return _download(numbers, folder, base_url, progress, retries, any_version)
+
+
+def _download(
+    numbers: Sequence[int], folder: Path, base_url: str, progress: Progress | None, retries: Retries, any_version: bool
+) -> Downloaded:
     listed = folder / MANIFEST
     manifest = _hashes(listed.read_text(encoding="utf-8", errors="replace")) if listed.is_file() else {}
     tested = known_hashes()
@@ -217,7 +227,7 @@ def _fetch(url: str, target: Path, retries: Retries, progress: Progress | None) 
             failures = 1 if _size(part) > before else failures + 1
             _give_up_or_wait(error, url, failures, retries)
             continue
-        if total is not None and _size(part) < total:
+        if total is not None and _size(part) != total:
             reason = f"{_size(part):,} of {total:,} bytes came"
             failures = 1 if _size(part) > before else failures + 1
         elif reason := unsound(part, target.suffix):

@@ -16,7 +16,7 @@ from magnet.datamodules.fakes.cmu import write_amc, write_asf
 from magnet.datamodules.reading import download
 from magnet.datamodules.reading.download import DownloadError, Retries, download_cmu
 from magnet.datamodules.reading.recording import DataError
-from magnet.files import file_hash
+from magnet.files import Taken, alone, file_hash
 
 QUICK = Retries(attempts=3, backoff=0.001, timeout=5.0, pause=0.0)
 
@@ -148,6 +148,16 @@ def test_a_second_run_fetches_nothing_and_mends_what_was_damaged(site: Site, tmp
     (tmp_path / "singles" / "02_01.amc").write_bytes(site.files[AMC][:-1] + b"7")
     assert fetch(site, tmp_path).fetched == ("singles/02_01.amc",)
     check(site, tmp_path)
+
+
+def test_a_second_run_at_the_same_time_is_refused(site: Site, tmp_path: Path) -> None:
+    """Both would add to the part of one file, which is then too long."""
+    with alone(tmp_path / download.LOCK, "taken"), pytest.raises(Taken, match="another download is working in"):
+        fetch(site, tmp_path)
+    assert not site.asked
+    fetch(site, tmp_path)
+    check(site, tmp_path)
+    assert not (tmp_path / download.LOCK).exists()
 
 
 def test_files_put_there_by_hand_are_kept_if_they_read_well(site: Site, tmp_path: Path) -> None:
