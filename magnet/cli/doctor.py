@@ -240,7 +240,7 @@ def _recordings() -> Finding:
         advice = "magnet data download cmu FOLDER, then export MAGNET_CMU=FOLDER; nothing but training on them needs it"
         return Finding("files", "CMU", "missing", "MAGNET_CMU is not set", advice)
     folder = Path(said).expanduser()
-    takes = sum(1 for path in files_under(folder) if path.suffix.lower() == ".amc")
+    takes = sum(1 for path in files_under(folder) if path.suffix.lower() == ".amc") if folder.is_dir() else 0
     if not takes:
         return Finding("files", "CMU", "wrong", f"MAGNET_CMU is {said}, which holds no .amc", "set it to the folder")
     return Finding("files", "CMU", "ok", f"{folder}, {takes} recordings")

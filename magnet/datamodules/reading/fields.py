@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from magnet.datamodules.reading.arrays import Doubles, floats, one_length, one_shape, require
 from magnet.datamodules.reading.recording import GENDERS, Axis, Gender, Recording
-from magnet.errors import first_names
+from magnet.errors import first_names, warn_user
 from magnet.unpickle import load_object_npy, load_pickle, mapping
 
 
@@ -144,18 +145,23 @@ def _folders(root: Path, parts: Sequence[str]) -> list[Path]:
 def files_under(root: Path) -> Iterator[Path]:
     """All files under a folder, and under those that links in it lead to; no folder twice, so that no link goes round.
 
-    A link that leads nowhere counts as a file, which whoever reads it finds missing.
+    A link that leads nowhere counts as a file, which whoever reads it finds missing; a folder that may not be read is
+    warned of.
     """
     seen: set[str] = set()
+    refused: list[OSError] = []
     starts = [str(root)]  # links come last: what lies in the folder itself keeps its name
     for start in starts:
-        for folder, below, names in os.walk(start):
+        for folder, below, names in os.walk(start, onerror=refused.append):
             if (place := os.path.realpath(folder)) in seen:
                 below.clear()
                 continue
             seen.add(place)
             starts += sorted(path for name in below if os.path.islink(path := os.path.join(folder, name)))
             yield from (Path(folder, name) for name in names)
+    if parent_process() is None:  # processes that convert takes have looked, too
+        for error in refused:
+            warn_user(f"{error.filename}: cannot be read ({error.strerror}); what is in it is left out")
 
 
 def listing(folder: Path, most: int = 8) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -134,3 +136,17 @@ def test_links_are_followed_once_and_one_that_leads_nowhere_is_a_file_that_is_mi
     names = [path.relative_to(root).as_posix() for path in files]
     assert names == ["a/dance.bvh", "walk_A.bvh", "walk_B.bvh", "z/own.bvh"]
     assert told(by_names(root, files))["walk"] == ["A", "B"]
+
+
+def test_a_folder_that_may_not_be_read_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made(tmp_path, "a/walk.bvh", "theirs/walk.bvh")
+    scandir = os.scandir
+
+    def refused(path: str) -> object:
+        if os.path.basename(path) == "theirs":
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refused)
+    with pytest.warns(UserWarning, match="theirs: cannot be read"):
+        assert [path.parent.name for path in files_of(tmp_path, (".bvh",))] == ["a"]
