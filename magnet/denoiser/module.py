@@ -52,13 +52,15 @@ class Denoiser(DenoiserCore, TokenModel):
         for part in parts if self.posterior is None else [*parts, self.posterior]:
             fully_shard(part, mesh=self.device_mesh["data_parallel"])
 
-    def on_fit_start(self) -> None:
+    def begin(self) -> None:
         if not self.normalizer.ready:
             if self.hparams["start_from"]:
                 self.take_over(self.hparams["start_from"])
             self.origin = origins.begun(self.hparams["start_from"], self.hparams["tokenizer"])
-            if not self.normalizer.ready:
-                self._fit_statistics()
+            super().begin()
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
         if self.hparams["cuda_graph"] and self.device.type == "cuda":
             self._require_recordable()
             self.graphed = GraphedStep(self.losses_of, self.trained())

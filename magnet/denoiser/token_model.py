@@ -6,7 +6,6 @@ import copy
 from pathlib import Path
 from typing import Any, Self
 
-import lightning as L
 import torch
 from torch import Tensor
 
@@ -17,9 +16,10 @@ from magnet.denoiser.token_core import TokenModelCore
 from magnet.precision import require_float32_scenes
 from magnet.tokenizer.core import TokenizerCore
 from magnet.training import origins
+from magnet.training.optim import Trained
 
 
-class TokenModel(TokenModelCore, L.LightningModule):
+class TokenModel(TokenModelCore, Trained):
     """Base of networks that are trained to predict motion tokens: `TokenModelCore` as a LightningModule."""
 
     _body: tuple[Body, ...] = ()  # in a tuple, so that it is no part of the model that is saved and averaged
@@ -53,6 +53,10 @@ class TokenModel(TokenModelCore, L.LightningModule):
 
     def setup(self, stage: str) -> None:
         require_float32_scenes(self.trainer.precision)
+
+    def begin(self) -> None:
+        if not self.normalizer.ready:
+            self._fit_statistics()
 
     @torch.no_grad()
     def _fit_statistics(self) -> None:

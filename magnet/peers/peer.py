@@ -107,10 +107,6 @@ class Peer(TokenModel):
         """Numbers of a token that say nothing of the partner: latent and deltas."""
         return self.layout.latent + 9 * TOKEN_FRAMES
 
-    def on_fit_start(self) -> None:
-        if not self.normalizer.ready:
-            self._fit_statistics()
-
     def losses(self, scene: Scene, generator: torch.Generator) -> dict[str, Tensor]:
         """The terms of the loss and their sum `loss`."""
         with torch.no_grad():

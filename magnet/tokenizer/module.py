@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Self
 
-import lightning as L
 import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
@@ -27,7 +26,7 @@ from magnet.tokenizer.quantizer import KMEANS_VECTORS
 from magnet.tokenizer.raw import RawPose
 from magnet.tokenizer.usage import CodeUse, by_quantizer
 from magnet.training import origins
-from magnet.training.optim import warmup_cosine
+from magnet.training.optim import Trained, warmup_cosine
 from magnet.training.validation import log_means
 
 __all__ = ["RawPose", "Tokenizer"]
@@ -37,7 +36,7 @@ GLANCE = 4
 """Scenes of a training batch whose joint error is logged: enough for a curve, at no cost."""
 
 
-class Tokenizer(TokenizerCore, L.LightningModule):
+class Tokenizer(TokenizerCore, Trained):
     """Conditional VQ-VAE of one person's pose (paper 3.1, Table A.2), and its training.
 
     Options are those of `TokenizerCore`.
@@ -101,8 +100,8 @@ class Tokenizer(TokenizerCore, L.LightningModule):
     def _initialized(self) -> bool:
         return bool(self.quantizer.initialized) and bool(self.vqvae.pose.ready)
 
-    def on_fit_start(self) -> None:
-        if not self._initialized:
+    def begin(self) -> None:
+        if not self.vqvae.pose.ready:  # codes may wait longer: what was trained until then is not to be lost
             if self.hparams["start_from"]:
                 self.take_weights(self.hparams["start_from"])
             self.origin = origins.begun(self.hparams["start_from"])
@@ -113,12 +112,16 @@ class Tokenizer(TokenizerCore, L.LightningModule):
         batches = getattr(getattr(self.trainer, "datamodule", None), "statistics_batches", None)
         if not self._initialized and batches is not None:
             self.init_codebook(batches())
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
         if self.hparams["compile"]:
             self.vqvae.encoder.compile()
             self.vqvae.decoder.compile()
 
     def on_train_start(self) -> None:
-        if not self._initialized:
+        super().on_train_start()
+        if not self._initialized:  # there is no data module
             self.init_codebook(self.trainer.train_dataloader)  # type: ignore[arg-type]
 
     def on_train_batch_start(self, batch: Scene, batch_idx: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -39,6 +40,32 @@ def warmup_cosine(
 
     schedule = Rates(optimizer, rate)
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class Trained(LightningModule):
+    """What all trainings share: how one begins, and a learning rate that Lightning's `Tuner.lr_find` finds and sets."""
+
+    optimizer: OptimizerOptions
+
+    @property
+    def learning_rate(self) -> float:
+        """The highest of a training, `optimizer.learning_rate`."""
+        return self.optimizer.learning_rate
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        self.optimizer = dataclasses.replace(self.optimizer, learning_rate=rate)
+        self.hparams["optimizer"] = dataclasses.asdict(self.optimizer)
+
+    def begin(self) -> None:
+        """Make ready what a first step needs, such as statistics of the data; called again, it changes nothing."""
+        raise NotImplementedError(f"{type(self).__name__} must implement begin()")
+
+    def on_fit_start(self) -> None:
+        self.begin()
+
+    def on_train_start(self) -> None:
+        self.begin()  # a `Tuner` tries steps before `on_fit_start`
 
 
 class Rates(torch.optim.lr_scheduler.LambdaLR):

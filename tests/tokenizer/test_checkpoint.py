@@ -66,6 +66,18 @@ def test_codes_start_after_the_steps_without_them_also_where_training_was_stoppe
     assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
 
 
+def test_what_waits_for_codes_does_not_start_from_another_again(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:
+    waiting = {"start_from": str(run[1] / "epoch=0.ckpt"), "quantizer": {"continuous_steps": 100, "codebook_size": 64}}
+    first, keep = tiny(**waiting), ModelCheckpoint(tmp_path, filename="{epoch}", save_top_k=-1)
+    trainer(tmp_path, max_epochs=3, limit_val_batches=0, callbacks=[keep]).fit(first, datamodule=Scenes())
+    again = tiny(**waiting)
+    resume = {"ckpt_path": tmp_path / "epoch=0.ckpt", "weights_only": True}
+    quick = {"limit_val_batches": 0, "enable_checkpointing": False}
+    trainer(tmp_path, max_epochs=3, **quick).fit(again, datamodule=Scenes(), **resume)
+    state = first.state_dict()
+    assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
+
+
 def test_training_the_decoder_alone_leaves_the_meaning_of_codes(
     run: tuple[Tokenizer, Path], tmp_path: Path, scene: Scene
 ) -> None:
