@@ -99,9 +99,11 @@ def answered(arguments: Sequence[str] | None = None) -> int:
         print(f"magnet {__version__}")
         return 0
     try:
-        with ended_by_sigterm(arguments[0]):
+        with ended_by_sigterm(arguments[0]), with_ctrl_c():
             return run(arguments[0], arguments[1:])
     except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning makes this of Ctrl+C
+            return complain(arguments[0], "interrupted", 130)
         if isinstance(stop.__context__, BrokenPipeError):  # rich ends the program where its output is closed
             return CLOSED
         return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
@@ -135,6 +137,17 @@ def ended_by_sigterm(command: str) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def with_ctrl_c() -> Iterator[None]:
+    """Ctrl+C does afterwards what it did before: a Trainer that it has ended leaves it ignored."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if before is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
 
 
 def underscored(argument: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch import Callback
 from torch import Tensor
 
 from magnet import cli
@@ -86,6 +87,24 @@ def validated(*runs: str) -> list[int]:
         with (Path(run) / "metrics.csv").open(newline="") as file:
             found += [int(row["step"]) for row in csv.DictReader(file) if row.get("val/loss")]
     return found
+
+
+@pytest.mark.parametrize("hook", ["on_fit_start", "on_test_start"])
+def test_ctrl_c_while_no_steps_are_made_ends_a_run_at_once_as_of_every_command(
+    hook: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And not as a failure, nor with Ctrl+C ignored by whatever runs next in the process."""
+    command = "test" if hook == "on_test_start" else "fit"
+    assert cli.main([*FIT, *CPU, "--trainer.max_steps", "1", "--out", "before"]) == 0
+    words = ["--ckpt_path", "before/checkpoints/last.ckpt", *CPU, "--out", "told"]
+
+    def ctrl_c(self: Callback, trainer: Any, pl_module: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Callback, hook, ctrl_c)
+    assert cli.main([command, *words]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == f"magnet {command}: error: interrupted"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3])
@@ -182,7 +201,7 @@ def test_the_second_ctrl_c_stops_at_once(
     toy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = tell(monkeypatch, signal.SIGINT, 2, times=2)
-    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 1
+    assert cli.main([*FIT, *HOW, *CPU, "--out", "told"]) == 130
     assert seen == [0, 1, 2]
     assert torch.load("told/checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
     assert "stopping after this step" in capsys.readouterr().err
@@ -213,7 +232,7 @@ def test_other_commands_end_at_once_by_ctrl_c(command: str, monkeypatch: pytest.
 
     name = {"test": "test_step", "validate": "validation_step", "predict": "predict_step"}[command]
     monkeypatch.setattr(ToyModel, name, step)
-    assert cli.main([command, "--ckpt_path", "whole/checkpoints/last.ckpt", *CPU]) == 1
+    assert cli.main([command, "--ckpt_path", "whole/checkpoints/last.ckpt", *CPU]) == 130
     assert seen == [signal.default_int_handler]
 
 
