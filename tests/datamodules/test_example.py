@@ -16,6 +16,7 @@ import torch
 from magnet import cli
 from magnet.body import load_body
 from magnet.datamodules import registry
+from magnet.datamodules.preparing import convert
 from magnet.errors import DataError
 from magnet.synthesis import synthesize
 
@@ -70,8 +71,9 @@ def test_it_is_listed_checked_prepared_and_trained_on(
 
 @pytest.mark.slow
 def test_several_processes_prepare_it_where_its_module_was_only_imported(
-    waltzes: ModuleType, download: Path, tmp_path: Path, capsys
+    waltzes: ModuleType, download: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(convert, "ALONE", 0)
     command = ["data", "prepare", "waltzes", "--root", str(download), str(tmp_path / "store"), "--workers", "2"]
     assert cli.main(command) == 0, capsys.readouterr().err
 

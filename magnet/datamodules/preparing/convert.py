@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -36,6 +37,8 @@ from magnet.threads import one_thread
 
 PART_VERSION = 2
 """Raise it whenever a part holds something else: takes prepared before are then made anew."""
+ALONE = 8.0
+"""Seconds that this process may take for all takes before others are started, each of which imports everything anew."""
 BODY_FROM = {
     "smplx": "https://smpl-x.is.tue.mpg.de (register; SMPLX_NEUTRAL.npz or .pkl)",
     "smpl": "https://smpl.is.tue.mpg.de for SMPL, https://mano.is.tue.mpg.de for SMPL-H (register; npz or pkl)",
@@ -350,18 +353,31 @@ def in_a_notebook(kind: type) -> bool:
     return kind.__module__ == "__main__" and not hasattr(sys.modules["__main__"], "__file__")
 
 
+def _converted_here(
+    job: PrepareJob, takes: list[Take], file: Callable[[Take], Path | None]
+) -> Iterator[tuple[Take, ConvertedTake]]:
+    reader, body, bodies = job.reader(), job.body(), job.bodies()
+    for take in takes:
+        with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
+            part, path = convert(reader, take, body, job.canonicalize, bodies), file(take)
+            part = part if path is None else part.saved(path)
+        yield take, part
+
+
 def _converted(
     job: PrepareJob, takes: list[Take], file: Callable[[Take], Path | None], workers: int
 ) -> Iterator[tuple[Take, ConvertedTake]]:
     kind = registry.reader(job.name)
+    here = _converted_here(job, takes[::-1], file)  # the smallest first: it tells how long the others will take
     if workers == 1 or len(takes) < 2 or in_a_notebook(kind):
-        reader, body, bodies = job.reader(), job.body(), job.bodies()
-        for take in takes:
-            with one_thread():  # as in worker processes: sums come out the same whatever the number of cores
-                part, path = convert(reader, take, body, job.canonicalize, bodies), file(take)
-                part = part if path is None else part.saved(path)
-            yield take, part
+        yield from here
         return
+    began, size = time.monotonic(), sizes(takes)
+    yield next(here)
+    if (time.monotonic() - began) * sum(size.values()) / size[takes[-1].name] < ALONE:
+        yield from here
+        return
+    takes = takes[:-1]
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job, kind))
     try:

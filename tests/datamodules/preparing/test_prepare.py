@@ -7,11 +7,14 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import torch
 
 from magnet.datamodules import registry
+from magnet.datamodules.preparing import convert
 from magnet.datamodules.preparing import pack as prepare_pack
 from magnet.datamodules.preparing.canonicalize import CanonicalizeOptions
 from magnet.datamodules.preparing.check import check_store
@@ -60,14 +63,16 @@ def undisturbed(couples, tmp_path_factory) -> dict[str, bytes]:
 
 
 def doomed(order: PrepareJob, out: Path, during: str, workers: int, reached: Path) -> None:
-    """In a process that is going to be killed: stops after the first take, or half-way through the second file."""
+    """In a process that is going to be killed: stops after the second take, or half-way through the second file."""
+    told: list[int] = []
 
     def stop() -> None:
         reached.touch()
         time.sleep(600)
 
     def tell(_: str, done: int, total: int) -> None:
-        if during == "conversion" and done:
+        told.append(done)
+        if during == "conversion" and len(told) == 3:
             stop()
 
     write, written = prepare_pack.write_whole, []
@@ -82,6 +87,7 @@ def doomed(order: PrepareJob, out: Path, during: str, workers: int, reached: Pat
         return write(folder, name, begin if len(written) == 2 else put)
 
     prepare_pack.write_whole = half
+    convert.ALONE = 0  # type: ignore[misc]  # others are started after the first take
     prepare(order, out, workers=workers, shard_rows=200, progress=tell)
 
 
@@ -111,6 +117,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp
     finally:
         process.kill()
         process.join()
+    assert bool(started) == (workers == 2)
     until(lambda: not any(child.exists() for child in started))  # workers do not outlive who started them
     assert not (out / "manifest.json").exists()  # nothing that reads as a store
     left = {path.name.split("-")[0] for path in out.iterdir()}
@@ -149,13 +156,32 @@ def test_dying_while_the_store_is_written_leaves_the_old_one_whole(order, whole,
 
 
 @pytest.mark.slow
-def test_two_workers_write_the_bytes_of_one(couples, undisturbed, tmp_path):
+def test_two_workers_write_the_bytes_of_one(couples, undisturbed, tmp_path, monkeypatch):
+    monkeypatch.setattr(convert, "ALONE", 0)
     told: list[tuple[int, int]] = []
     prepare(
         couples, tmp_path / "2", workers=2, shard_rows=200, progress=lambda _, done, total: told.append((done, total))
     )
     assert content(tmp_path / "2") == undisturbed
     assert told == sorted(told) and told[-1][0] == told[-1][1] and len(told) == 1 + len(couples.reader().takes())
+
+
+@pytest.mark.parametrize(("alone", "started"), [(600.0, 0), (0.0, 1)])
+def test_other_processes_are_started_where_there_is_work_for_them(couples, tmp_path, monkeypatch, alone, started):
+    """Each imports everything anew: of three short recordings that took longer than all the rest."""
+    pools = []
+
+    class Here(ThreadPoolExecutor):
+        def __init__(self, count, mp_context, **begin):
+            pools.append(count)
+            super().__init__(1, **begin)
+
+    monkeypatch.setattr(convert, "ALONE", alone)
+    monkeypatch.setattr(convert, "ProcessPoolExecutor", Here)
+    threads = torch.get_num_threads()
+    assert prepare(couples, tmp_path / "store", workers=2).made == 5
+    torch.set_num_threads(threads)  # one in each such process
+    assert pools == [2] * started
 
 
 def test_only_what_changed_is_made_again(order, tmp_path):

@@ -307,6 +307,8 @@ def calls_for(count: int, job: PrepareJob, monkeypatch: pytest.MonkeyPatch) -> i
 
     pool = SimpleNamespace(submit=submit, shutdown=lambda **_: None)
     monkeypatch.setattr(convert, "ProcessPoolExecutor", lambda *_, **__: pool)
+    monkeypatch.setattr(convert, "convert", lambda *_: "done")
+    monkeypatch.setattr(convert, "ALONE", 0)
     takes = [Take(f"take {number}", (), "train") for number in range(count)]
     calls: list[str] = []
     sys.setprofile(lambda frame, event, value: calls.append(event))
