@@ -16,7 +16,7 @@ from typing import Any
 from magnet.cli import predict_files, scene_files
 from magnet.cli.errors import CommandError, explain, no_such
 from magnet.cli.named_files import unquoted
-from magnet.cli.pipes import CLOSED, output_closed, replace_closed, take_any_letter
+from magnet.cli.pipes import CLOSED, drop, output_closed, replace_closed, take_any_letter
 from magnet.cli.run_numbers import too_large
 from magnet.errors import Stopped
 from magnet.version import __version__
@@ -78,12 +78,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None and not wants_traces(sys.argv[1:]):  # of a process that is nobody else's
         warnings.showwarning = warn_in_a_line
     try:
-        code = answered(arguments)
-        print(end="", flush=True)  # here, for what fails once Python ends is told with a traceback
+        code = written_out(answered(arguments))  # here, for what fails once Python ends is told with a traceback
     except BrokenPipeError:  # it may as well be another process's connection
         if not output_closed():
             raise
         return CLOSED
+    return code
+
+
+def written_out(code: int) -> int:
+    """Hand on what was printed, which may lead onto a full disk. Returns the exit code."""
+    try:
+        print(end="", flush=True)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        drop(sys.stdout)  # it cannot be written later, either
+        return code or complain("", f"what was printed is not whole: {explain(error)}")
     return code
 
 
@@ -92,23 +103,24 @@ def answered(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = wants_traces(arguments)
     arguments = [underscored(argument) for argument in arguments if argument != "--debug"]
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(usage(), end="")
-        return 0
-    if arguments[0] in ("-V", "--version", "version"):
-        print(f"magnet {__version__}")
-        return 0
+    command = arguments[0] if arguments else "help"
     try:
-        with ended_by_sigterm(arguments[0]), with_ctrl_c():
-            return run(arguments[0], arguments[1:])
+        if command in ("-h", "--help", "help"):
+            print(usage(), end="")
+            return 0
+        if command in ("-V", "--version", "version"):
+            print(f"magnet {__version__}")
+            return 0
+        with ended_by_sigterm(command), with_ctrl_c():
+            return run(command, arguments[1:])
     except SystemExit as stop:
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning makes this of Ctrl+C
-            return complain(arguments[0], "interrupted", 130)
+            return complain(command, "interrupted", 130)
         if isinstance(stop.__context__, BrokenPipeError):  # rich ends the program where its output is closed
             return CLOSED
         return stop.code if isinstance(stop.code, int) else int(bool(stop.code))
     except KeyboardInterrupt:
-        return complain(arguments[0], "interrupted", 130)
+        return complain(command, "interrupted", 130)
     except Exception as error:
         if isinstance(error, BrokenPipeError) and output_closed():
             return CLOSED
@@ -116,7 +128,7 @@ def answered(arguments: Sequence[str] | None = None) -> int:
         message = (too_large(arguments) if overflow else None) or explain(error)
         if debug or message is None:
             raise
-        return complain(arguments[0], message + unquoted(arguments))
+        return complain(command, message + unquoted(arguments))
 
 
 @contextmanager

@@ -43,8 +43,14 @@ def _dropped(stream: object) -> bool:
         poll = select.poll()
         poll.register(number, 0)
         if any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, number)
-            os.close(nowhere)
+            drop(stream)
             return True
     return False
+
+
+def drop(stream: object) -> None:
+    """Let what is written to a file of the system from now on go nowhere, and what waits to be written."""
+    number = stream.fileno()  # type: ignore[attr-defined]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, number)
+    os.close(nowhere)

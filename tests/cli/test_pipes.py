@@ -52,6 +52,18 @@ def test_a_closed_pipe_ends_a_command_quietly(words: tuple[str, ...], tmp_path: 
     assert code in (CLOSED, 0) if "score" in words else code == CLOSED  # argparse drops help that it cannot write
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@pytest.mark.parametrize("words", [("--version",), ("tasks",)])
+def test_an_output_onto_a_full_disk_is_told_in_a_line(words: tuple[str, ...], tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "magnet", *words]
+        options = {"cwd": tmp_path, "env": environment, "text": True, "timeout": 120, "check": False}
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, **options)
+    (line,) = done.stderr.splitlines()
+    assert "the disk is full: free some space" in line and done.returncode == 2
+
+
 def test_a_mistake_that_nobody_reads_of_ends_quietly_too(tmp_path: Path) -> None:
     assert unread(tmp_path, "-m", "magnet", "tset", both=True) == (CLOSED, "")
 
