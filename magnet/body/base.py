@@ -211,14 +211,12 @@ def load_body(which: str | Path = "open") -> Body:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, lacks a key, or a shape does not fit; says which.
     """
-    if str(which) == "open":
-        return Body(**open_body_arrays())
-    return Body(**_read(Path(which)))  # type: ignore[arg-type]
+    with torch.inference_mode(False):  # Lightning tests in it, whose tensors no later fit could take a gradient through
+        return Body(**(open_body_arrays() if str(which) == "open" else _read(Path(which))))
 
 
 @lru_cache(maxsize=1)
 def open_body_arrays() -> dict:
-    # Lightning tests in inference mode, whose tensors no later fit could take a gradient through.
     with torch.inference_mode(False), resources.as_file(resources.files("magnet.body") / "open_body.npz") as path:
         return _read(path)
 

@@ -93,6 +93,8 @@ def kabsch(rest: Tensor, posed: Tensor) -> Tensor:
 # -- the fit -----------------------------------------------------------------------------------
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def fit_body(
     targets: Tensor,
     joints: Sequence[int],
@@ -108,7 +110,7 @@ def fit_body(
     settings: FitSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BodyFit:
-    """Poses and shapes of `body` whose joints lie at the targets.
+    """Poses and shapes of `body` whose joints lie at the targets; a descent, also where the caller wants no gradients.
 
     Args:
         targets: (T, P, M, 3) world positions of M of the 22 joints, metres, y up.
@@ -128,10 +130,10 @@ def fit_body(
     settings = settings or FitSettings()
     valid = _checked(targets, joints, rotations, valid)
     T, P, M = targets.shape[:3]
-    targets = targets.float()
+    targets = targets.float().clone()  # no gradient may pass a tensor that was made in inference mode
     weights = torch.ones(M, device=targets.device) if weights is None else weights.to(targets)
     weights = weights.expand(T, P, M) * valid[..., None]
-    hints = None if rotations is None else rotations.to(targets)
+    hints = None if rotations is None else rotations.to(targets).clone()
     fit_shape = betas is None
     total = settings.steps + (settings.shape_steps if fit_shape or grounded else 0)
     tell = progress or (lambda done, total: None)

@@ -46,7 +46,8 @@ def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
     """
     name = f"data set {type(data).__module__}.{type(data).__qualname__}"
     given: list[Any] = []
-    error = attempted(lambda: given.append(data.clips(split)))
+    with torch.inference_mode(False), torch.enable_grad():  # Lightning tests in it, and clips may have to be fitted
+        error = attempted(lambda: given.append(data.clips(split)))
     if isinstance(error, ValueError | OSError | ImportError):
         raise error  # what is wrong with files, or not installed, is said already
     if error is not None:

@@ -216,6 +216,13 @@ def test_files_with_any_number_of_shapes_and_vertices_are_read(tmp_path, columns
     np.testing.assert_allclose(body.rest_joints(betas).numpy(), (arrays["J_regressor"] @ skin)[:22], atol=1e-6)
 
 
+def test_a_file_read_while_testing_gives_a_body_that_can_be_fitted_afterwards(tmp_path):
+    synthetic_file(tmp_path / "SMPLX_NEUTRAL.npz", V=60)
+    with torch.inference_mode():
+        body = load_body(tmp_path / "SMPLX_NEUTRAL.npz")
+    assert not any(tensor.is_inference() for tensor in body.buffers())
+
+
 @pytest.mark.parametrize("key", ["v_template", "shapedirs", "weights", "kintree_table", "f", "J_regressor"])
 def test_a_missing_key_is_named(tmp_path, key):
     arrays = synthetic_file(tmp_path / "whole.npz")

@@ -81,6 +81,28 @@ def test_targets_of_the_body_itself_are_met_within_a_centimetre(
     assert fit.scene.body == body.id
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("known", [False, True], ids=["joints alone", "shapes and rotations known"])
+def test_a_fit_is_the_same_where_the_caller_wants_no_gradients(
+    body: Body, moving: Scene, mode: type[torch.no_grad] | type[torch.inference_mode], known: bool
+) -> None:
+    few = replace(QUICK, steps=3, shape_steps=3)
+    local = torch.cat([moving.T_world_root[0, :, :, None, :3, :3], moving.body_rot[0]], dim=2)
+
+    def fitted() -> Scene:
+        targets = body.joints(moving)[0]
+        rotations, betas = (local.clone(), moving.betas[0].clone()) if known else (None, None)
+        return fit_body(
+            targets, ALL, body, rotations=rotations, betas=betas, settings=few, grounded=True, refuse_above=9.0
+        ).scene
+
+    expected = fitted()
+    with mode():
+        got = fitted()
+    for field, tensor in expected.tensors().items():
+        assert torch.equal(getattr(got, field), tensor), field
+
+
 def test_a_fit_to_joints_alone_starts_with_thighs_that_lead_to_the_knees(body: Body, moving: Scene) -> None:
     targets, rest = body.joints(moving)[0], body.rest_joints(moving.betas[0])
     sure = torch.ones(targets.shape[:3], dtype=torch.bool)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from magnet.body.mirror import mirror_scene
-from magnet.datamodules import Clip, Mixed
+from magnet.datamodules import Clip, Mixed, Split
 from magnet.datamodules.base import EmptySplitError, MotionDataModule
 from magnet.datamodules.options import Augmentation, HeldOutScenes
 from magnet.datamodules.store.windows import dropped
@@ -273,6 +273,21 @@ def test_what_is_too_long_for_the_clips_is_named() -> None:
     assert next(iter(fits.test_dataloader())).frames == 100
     with pytest.raises(ValueError, match="no clean stretch of 150 frames"):
         data.train_scenes(150)
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_clips_may_be_fitted_by_gradients_where_lightning_wants_none(
+    mode: type[torch.no_grad] | type[torch.inference_mode],
+) -> None:
+    class Fitted(MotionDataModule):
+        def clips(self, split: Split) -> list[Clip]:
+            shift = torch.zeros(3, requires_grad=True)
+            (shift - 1).square().sum().backward()
+            assert shift.grad is not None and shift.grad.tolist() == [-2.0] * 3
+            return [random_clip("a", 200, split=split)]
+
+    with mode():
+        assert next(iter(Fitted(test=HeldOutScenes(horizon_frames=68)).test_dataloader())).frames == 100
 
 
 def test_people_without_a_slot_are_refused() -> None:
