@@ -75,7 +75,7 @@ def context_of(options: argparse.Namespace, frames: int, recorded: int, nothing:
     if whole > recorded or context > frames:
         raise CommandError(f"--context {context}: the files hold {recorded} frames in whole tokens; give fewer")
     if whole < context:
-        print(f"--context {context}: {whole} are given, for a token is {TOKEN_FRAMES} frames")
+        print(f"--context {context}: {whole} are given, in tokens of {TOKEN_FRAMES} frames")
     return whole
 
 

@@ -27,7 +27,7 @@ def in_front(recorded: Scene, read: Scene) -> tuple[Scene, int]:
     lost = f", {first} left out" if left_out else ""
     front = "one before them stays" if lead - left_out == 1 else f"{lead - left_out} before them stay"
     kept = f", the {front} in front" if left_out < lead else ""
-    print(f"of {recorded.frames} frames the last {read.frames} are read, for a token is 4{kept}{lost}")
+    print(f"of {recorded.frames} frames the last {read.frames} are read, in tokens of 4 frames{kept}{lost}")
     return recorded.slice(left_out), lead - left_out
 
 

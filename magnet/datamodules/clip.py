@@ -48,7 +48,9 @@ class Clip:
             shape = tuple(self.scene.T_world_root.shape[:3])
             raise ValueError(f"clip {self.name}: got (B, T, P) = {shape}, expected one scene with frames and agents")
         if not bool(self.scene.present.all()):
-            raise ValueError(f"clip {self.name}: has an absent agent; a clip holds only the people who are there")
+            there = self.scene.present[0].nonzero()[:, 0].tolist()
+            keep = f"scene.permute_agents(torch.tensor({there})) keeps them" if there else "there is nobody"
+            raise ValueError(f"clip {self.name}: has an absent agent; a clip holds only who is there: {keep}")
         if self.scene.valid is not None:  # what is masked may be anything
             object.__setattr__(self, "scene", held(self.scene, self.scene.valid))
         for field in ("body_rot", "T_world_root", "betas"):

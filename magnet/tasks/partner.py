@@ -34,9 +34,10 @@ def chosen(grid: Grid, target: tuple[int, ...], name: str = "target", has: str =
             raise ValueError(f"{name} {agent}: {has} 0 to {grid.agents - 1}")
         mask[agent] = True
     if not mask.any() or mask.all():
-        more = "; of one person who is given, `magnet predict --people 2` adds another, in Python inpaint(agent=1)"
-        more = more if grid.agents == 1 else ""
-        raise ValueError(f"{name} {target}: name some of the {grid.agents} agents, not none and not all{more}")
+        if grid.agents == 1:
+            adds = "`magnet predict --people 2` adds another, in Python inpaint(agent=1)"
+            raise ValueError(f"{name} {target}: there is one person alone, and somebody has to be given; {adds}")
+        raise ValueError(f"{name} {target}: name some of the {grid.agents} agents, not none and not all")
     return mask
 
 

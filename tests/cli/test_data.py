@@ -192,7 +192,7 @@ def test_skipped_takes_are_listed_and_the_exit_code_is_0_while_anything_is_left(
         ("prepare interXX", "did you mean interx"),
         ("prepare dd100 dl o", "got o, expected an option; the folder that is read is --root FOLDER"),
         ("prepare dd100 --root nowhere --out o", "nowhere is not a folder"),
-        ("prepare dd100 --root dl --out o", "give the body's file with --body FILE"),
+        ("prepare dd100 --root dl --out o", "shape numbers of SMPL-X: give the body's file with --body FILE"),
         ("prepare dd100 --root dl --out o --body dl/body.npz --wrong 1", "no option --wrong"),
         ("prepare dd100 --root dl --out o --reader.people=actor --wrong 1", "no option --wrong"),
         ("prepare dd100 --root dl --out o --reader.people actor --wrong=1", "no option --wrong."),

@@ -84,7 +84,7 @@ def test_what_goes_on_stands_behind_all_of_the_recording(duet, tmp_path, capsys)
     recorded.save(tmp_path / "long.npz")
     words = (str(tmp_path / "long.npz"), "--frames", "4", "--samples", "2", "--out", str(out), *QUICK)
     text = said(capsys, *words)
-    assert "of 47 frames the last 44 are read, for a token is 4, the 3 before them stay in front" in text
+    assert "of 47 frames the last 44 are read, in tokens of 4 frames, the 3 before them stay in front" in text
     assert "102 frames, of which 94 are given" in text
     made = Scene.load(out)
     assert made.frames == 47 + 4 and made.given[:, :47].all() and not made.given[:, 47:].any()

@@ -248,7 +248,7 @@ def test_help_names_tasks_and_not_what_stands_for_them(capsys: pytest.CaptureFix
         (["show", "agentic_async", "--poeple", "3"], "no option --poeple; did you mean --people?"),
         (["show", "agentic_async", "--task.offset", "half"], "--task.offset: got half, expected a number"),
         (["show", "agentic_async", "--task.offset", "2"], "expected 0 to 1"),
-        (["show", "partner_inpainting", "--people", "1"], "name some of the 1 agents"),
+        (["show", "partner_inpainting", "--people", "1"], "there is one person alone, and somebody has to be given"),
         (["show", "joint_future", "--context", "0"], "give it context frames"),
         (["show", "joint_future", "--tokens", "0"], "tokens: got 0, expected at least 1"),
         (["show", "joint_future", "--moments", "1"], "4 or more"),

@@ -129,7 +129,7 @@ class PrepareJob:
         kind = registry.reader(self.name)
         if self.body_file == "open" and kind.family not in ("positions", "any"):
             raise ValueError(
-                f"{kind.title} holds shape numbers of {kind.family.upper()}: give the body's file with --body FILE, "
+                f"{kind.title} holds shape numbers of {title(kind.family)}: give the body's file with --body FILE, "
                 f"from {BODY_FROM[kind.family]}; `magnet data fake` writes a made-up body.npz beside its files"
             )
         body = load_body(self.body_file)

@@ -102,8 +102,8 @@ class MemoryStore:
         most = int(self.people.argmax())
         if self.people[most] > max_agents:
             raise ValueError(
-                f"clip {self.names[most]} has {self.people[most]} people, but max_agents is {max_agents}; raise"
-                " max_agents"
+                f"clip {self.names[most]} has {self.people[most]} people, but max_agents is {max_agents}; "
+                f"say --data.max_agents {self.people[most]}, in Python max_agents={self.people[most]}"
             )
 
     def _first_rows(self) -> dict[str, Tensor]:
