@@ -8,14 +8,17 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+import magnet
 from magnet import cli
 from magnet.body import load_body
 from magnet.datamodules import registry
+from magnet.datamodules.options import HeldOutScenes
 from magnet.datamodules.preparing import convert
 from magnet.errors import DataError
 from magnet.synthesis import synthesize
@@ -51,6 +54,23 @@ def test_the_page_shows_the_whole_module() -> None:
     text = (EXAMPLE / "magnet_duel/waltzes.py").read_text()
     shown = text.partition("from __future__ import annotations\n\n")[2]
     assert f"```python\n# magnet_duel/waltzes.py\n{shown}```" in (ROOT / "docs/own.md").read_text()
+
+
+def test_the_data_set_of_the_page_without_a_reader_gives_what_its_files_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = synthesize("mirror", 2, FRAMES, torch.Generator().manual_seed(0), load_body()).scene
+    monkeypatch.chdir(tmp_path)
+    for slot, letter in enumerate("AB"):
+        magnet.Motion.of(scene.permute_agents(torch.tensor([slot]))).save(f"take_{letter}.bvh")
+    block = (ROOT / "docs/own.md").read_text().partition("```python\n# mydata.py\n")[2].partition("```")[0]
+    here: dict[str, Any] = {"__name__": "mydata"}
+    exec(compile(block, "mydata.py", "exec"), here)
+    data = here["Mine"](test=HeldOutScenes(horizon_frames=FRAMES - 32))
+    (batch,) = data.test_dataloader()
+    assert batch.agents == 2 and batch.frames == FRAMES
+    body = load_body()
+    torch.testing.assert_close(body.joints(batch), body.joints(scene), atol=1e-3, rtol=0)
 
 
 def test_it_is_listed_checked_prepared_and_trained_on(
