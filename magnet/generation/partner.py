@@ -75,8 +75,7 @@ class Partner:
     ) -> None:
         denoiser = denoiser_of(denoiser)
         require_rate(past, "past")
-        # A copy, because the caller may write over it.
-        past = past.replace(**{name: value.detach().clone() for name, value in past.tensors().items()})
+        past = past.clone()  # because the caller may write over it
         check_request(denoiser, past, 0, 0, 1)
         if past.frames < TOKEN_FRAMES:
             raise ValueError(f"past: got {past.frames} frames, expected at least {TOKEN_FRAMES}, of everybody")

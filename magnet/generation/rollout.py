@@ -34,6 +34,7 @@ from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.plan import periodic_plan, planned
 from magnet.generation.stats import SamplingStats
 from magnet.generation.world import WorldState
+from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.packing import count_unseen_writes
@@ -117,7 +118,8 @@ def stream(
     """Sample a task in consecutive chunks of frames, which together are what `generate` returns.
 
     A chunk comes when it is final: as late as the decoder looks ahead. Memory does not grow with the scene's length,
-    unless a keyframe far ahead decides where everything before it is placed. Arguments as for `generate`, and:
+    unless a keyframe far ahead decides where everything before it is placed. The recording and chunks that have come
+    may be written over. Arguments as for `generate`, and:
 
     Args:
         frames: None: endless, for tasks that are given nothing after the context.
@@ -135,7 +137,10 @@ def stream(
     if chunk is not None:
         require_whole("chunk", chunk, 1)
     more: dict[str, Any] = {"progress": progress, "stats": stats, "cond": cond, "chunk": chunk}
-    return Rollout(denoiser_of(model), scene, task, context, frames, samples, options, generator, **more).chunks()
+    model = denoiser_of(model)
+    require_rate(scene)
+    rollout = Rollout(model, scene.clone(), task, context, frames, samples, options, generator, **more)
+    return (made.clone() for made in rollout.chunks())
 
 
 class Rollout:

@@ -130,6 +130,10 @@ class Scene:
         floats = {name: value.detach() for name, value in self.tensors().items() if value.requires_grad}
         return self.replace(**floats) if floats else self
 
+    def clone(self) -> Self:
+        """The same scene in memory of its own, of which no gradient is taken."""
+        return self.replace(**{name: value.detach().clone() for name, value in self.tensors().items()})
+
     def slice(self, start: int, stop: int | None = None) -> Self:
         """Frames `start:stop` of every scene; negative ones count from the scene's end, and there may be none.
 

@@ -131,9 +131,7 @@ class LiveFrames:
         if late or not (tracked and bool(pose.body_rot.isfinite().all() and pose.T_world_root.isfinite().all())):
             self.passed_over += 1
             return None
-        # A copy: trackers write each pose over the one before.
-        pose = pose.replace(**{name: value.clone() for name, value in pose.tensors().items()})
-        pose = pose.replace(fps=FPS, valid=None)
+        pose = pose.clone().replace(fps=FPS, valid=None)  # trackers write each pose over the one before
         before, begins = self._pose, self._newest
         if before is None:
             self._start = begins = seconds
