@@ -16,6 +16,7 @@ from torch import Tensor
 
 from magnet.body.floor import open_body
 from magnet.denoiser.core import DenoiserCore
+from magnet.generation.growing import GrowingScene
 from magnet.generation.inputs import check_given
 from magnet.generation.keyframes import Goal, Keyframe, keyframe, reached, require_soon, with_keyframes
 from magnet.generation.loaded import Loaded, denoiser_of
@@ -24,7 +25,7 @@ from magnet.generation.plan import plan_of_scene
 from magnet.generation.rollout import generate
 from magnet.motion.frames import canonical_frame
 from magnet.motion.required import require_one, require_rate
-from magnet.motion.scene import Scene, cat_time, empty_scene
+from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
@@ -127,6 +128,7 @@ class Live:
         self.version = 0  # grows when frames that were there have changed
         self.made, self.spent = 0, 0.0
         self._partner: tuple[Any, Partner] | None = None  # who answers, and what for
+        self._growing = GrowingScene()
         self.scene: Scene
         self.begin(people, start)
 
@@ -302,7 +304,7 @@ class Live:
             took = time.perf_counter() - begun
             if version != self.version:  # what this chunk continues is no longer there
                 return LiveChunk(self.scene.frames, 0, took)
-            self.scene = cat_time([scene, chunk])
+            self.scene = self._growing.append(scene, chunk)
             self.version += anew
             self.made, self.spent = self.made + chunk.frames, self.spent + took
             return LiveChunk(scene.frames, chunk.frames, took)

@@ -21,7 +21,7 @@ def true_runs(mask: NDArray[np.bool_] | Sequence[bool], least: int = 1) -> list[
     >>> true_runs([True, True, False, True])
     [(0, 2), (3, 4)]
     """
-    edges = np.flatnonzero(np.diff(np.asarray([False, *mask, False], dtype=np.int8)))
+    edges = np.flatnonzero(np.diff(np.asarray(mask, dtype=np.int8), prepend=0, append=0))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2) if stop - start >= least]
 
 

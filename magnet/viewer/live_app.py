@@ -142,8 +142,8 @@ class LiveApp(ViewerBase):
                 self.again = None
                 self.slider.max = scene.frames - 1
                 self._cast(scene)
-            if scene.frames != self.views[0].take.frames:
-                self.views[0].take = take("", scene)
+            if scene.frames != (before := self.views[0].take.frames):
+                self.views[0].take = take("", scene, looked_at=before)
                 self.clock.frames = scene.frames
                 self.slider.max = scene.frames - 1
                 self.tracked = -1  # who has paused sees a longer timeline

@@ -57,7 +57,7 @@ def drawn(tracks: Tracks, now: int, fps: float) -> str:
         top = p * (TRACK + GAP)
         bar(0, frames, top, TRACK, "#e8ebf1")
         for given, colours in ((True, faint), (False, tracks.colours)):
-            for start, stop in true_runs((tracks.known[:, p] == given).tolist()):
+            for start, stop in true_runs(tracks.known[:, p] == given):
                 bar(start, stop, top, TRACK, hexed(colours[p]))
         for person, frame in tracks.keys:
             if person == p:

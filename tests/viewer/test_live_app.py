@@ -147,3 +147,17 @@ def test_who_pauses_sees_how_far_the_model_has_come_and_waits_for_nothing(app: A
     app.draw()
     frames = app.live.scene.frames
     assert frames > last + 1 and f"of {frames / 30:.1f} s" in app.clock_text.content
+
+
+def test_of_a_scene_that_grows_only_what_is_new_is_looked_through(app: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else each chunk would hold up the picture for longer the longer it plays."""
+    from magnet.viewer import live_app
+
+    take, asked = live_app.take, []
+    monkeypatch.setattr(live_app, "take", lambda *args, **more: (asked.append(more), take(*args, **more))[1])
+    app.worker.stop()
+    before = app.live.scene.frames
+    app.before_draw()
+    app.live.advance()
+    app.before_draw()
+    assert asked[-1] == {"looked_at": before} and app.views[0].take.frames == app.live.scene.frames > before

@@ -133,6 +133,16 @@ def test_numbers_that_are_not_finite_and_empty_scenes_are_refused(duet: Scene) -
         take("x", duet.replace(present=torch.zeros(1, 2, dtype=torch.bool)))
 
 
+def test_frames_that_were_looked_at_before_are_not_looked_at_again(duet: Scene) -> None:
+    """Of a scene that has grown; those that are new are named by their numbers in the whole of it."""
+    broken = duet.body_rot.clone()
+    broken[:, 7] = torch.nan
+    scene = duet.replace(body_rot=broken)
+    with pytest.raises(ValueError, match="body_rot is not finite in 1 frames, the first is frame 7"):
+        take("", scene, looked_at=5)
+    assert take("", scene, looked_at=8).frames == duet.frames
+
+
 def test_only_the_first_samples_of_a_large_file_are_shown(generator: torch.Generator) -> None:
     assert len(takes(random_scene(6, 8, 1, generator), "x", samples=3)) == 3
 

@@ -57,10 +57,13 @@ class ShownTake:
         return f"given: {those}" if those else ""
 
 
-def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None) -> ShownTake:
+def take(
+    label: str, scene: Scene, context: int = 0, recording: DenoisingTrace | None = None, looked_at: int = 0
+) -> ShownTake:
     """A scene (B = 1) made ready to be shown.
 
     Which frames a model was given says the scene's own `given`, else `context`, so many first frames of everybody.
+    So many first frames were `looked_at` before, in a take of a scene that has grown since.
 
     Raises:
         ValueError: nobody is there, no frames, or numbers that are not finite.
@@ -73,9 +76,9 @@ def take(label: str, scene: Scene, context: int = 0, recording: DenoisingTrace |
         shown = shown.permute_agents(slots.cpu())
         recording = recording and recording.permute_agents(slots.cpu())
     for name in ("T_world_root", "body_rot"):
-        broken = ~getattr(shown, name)[0].flatten(1).isfinite().all(dim=1)
+        broken = ~getattr(shown, name)[0, looked_at:].flatten(1).isfinite().all(dim=1)
         if bool(broken.any()):
-            first = int(broken.int().argmax())
+            first = looked_at + int(broken.int().argmax())
             raise ValueError(f"{label}: {name} is not finite in {int(broken.sum())} frames, the first is frame {first}")
     if scene.given is None and context > 0:
         past = torch.arange(scene.frames) < context
