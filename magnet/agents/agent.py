@@ -26,6 +26,8 @@ PAST = 8
 """Token steps that somebody who comes back goes on from, and that are told it."""
 KEPT = 64
 """Token steps of everybody that are kept: what the tokenizer looks back at, and more."""
+HELD = 18_000
+"""Frames in a row, ten minutes, for which somebody who told none is held in a file, at most."""
 
 
 @dataclass
@@ -67,10 +69,13 @@ def motion_told(told: Sequence[Message]) -> Scene:
     """One person's frames as messages told them, the first after the start scene first. -> (1, T, 1)
 
     Frames between them that nobody told, as where an agent joined later or went on where the others were, are held and
-    not valid, so that files of several agents are of one time.
+    not valid, so that files of several agents are of one time. Of more than `HELD` in a row the rest is left out: the
+    others may have run for days, or say so by mistake.
     """
     made = cat_time([motion_of(each.poses, each.betas) for each in told])
     numbers = torch.tensor([each.frame + k for each in told for k in range(len(each.poses))])
+    untold = numbers.diff(prepend=torch.tensor([-1])) - 1
+    numbers -= (untold - HELD).clamp(min=0).cumsum(dim=0)
     frames = torch.arange(int(numbers[-1]) + 1)
     index = (torch.searchsorted(numbers, frames, right=True) - 1).clamp(min=0)
     there = numbers[index] == frames

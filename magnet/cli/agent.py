@@ -164,7 +164,7 @@ def member_of(given: argparse.Namespace, start: Scene, names: Sequence[str]) -> 
 
 def take_part(given: argparse.Namespace, member: Member, link: Link, others: set[str]) -> None:
     """Run until it is over, and write what was asked for."""
-    from magnet.agents.agent import Agent, motion_told
+    from magnet.agents.agent import HELD, Agent, motion_told
     from magnet.agents.gate import Gate
     from magnet.agents.message import Message
     from magnet.agents.run import PERIOD, Process
@@ -206,5 +206,11 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
             print(
                 f"magnet: {int((~made.valid).sum())} of its {made.frames} frames were not made, where {given.name} "
                 "joined later or went on where the others were: they are held, and marked as not valid",
+                file=sys.stderr,
+            )
+        if left_out := told[-1].frame + len(told[-1].poses) - made.frames:
+            print(
+                f"magnet: {left_out} more frames that {given.name} did not make are left out, for no more than "
+                f"{HELD} in a row are held: in files of the others what follows comes later by so many",
                 file=sys.stderr,
             )

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.agents.agent import Agent, Player, motion_of, motion_told, poses_of
+from magnet.agents.agent import HELD, Agent, Player, motion_of, motion_told, poses_of
 from magnet.agents.gate import Gate
-from magnet.agents.message import pack
+from magnet.agents.message import Message, pack
 from magnet.denoiser.options import Sampling
 from magnet.generation.rollout import generate
 from magnet.motion.scene import Scene, cat_time
@@ -259,3 +259,17 @@ def test_frames_of_who_joined_later_or_went_on_elsewhere_are_kept_at_their_times
     torch.testing.assert_close(made.T_world_root[0, there, 0], start.T_world_root[0, there, 0], atol=1e-5, rtol=0)
     assert (made.T_world_root[0, 12:20] == made.T_world_root[0, 11]).all()
     assert motion_told([Player(recording, start, NAMES, "A").step()]).valid is None
+
+
+@pytest.mark.parametrize("far", [10**6, 2**38])
+def test_a_file_is_as_long_as_its_motion_and_ten_minutes_at_most_where_there_was_none(far: int) -> None:
+    """Where the others had run for days when it joined, or had counted their frames from another time."""
+    recording = random_scene(1, 16, 1, torch.Generator().manual_seed(6))
+    poses, frames = poses_of(recording), [far, far + 4, 2 * far, 2 * far + 8]
+    made = motion_told(
+        [Message("frames", "A", "A", 0, frame, 0.0, poses=poses[4 * n : 4 * n + 4]) for n, frame in enumerate(frames)]
+    )
+    there = torch.zeros(HELD + 8 + HELD + 4 + 4 + 4, dtype=torch.bool)
+    there[HELD : HELD + 8] = there[2 * HELD + 8 : 2 * HELD + 12] = there[-4:] = True
+    assert made.valid is not None and torch.equal(made.valid[0], there)
+    torch.testing.assert_close(made.T_world_root[0, there], recording.T_world_root[0], atol=1e-5, rtol=0)
