@@ -20,6 +20,7 @@ from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
 from magnet.body.indices import pairs_of
 from magnet.body.jumps import unjumped
 from magnet.body.settle import Settle, corrected, correction
+from magnet.body.settle_past import Past, past_of
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
 from magnet.motion.scene import FPS, Scene, cat_time, concatenate
 
@@ -102,15 +103,15 @@ def repaired(
         return _by_stretches(scene, fixed, begun, repair)
     if drifting:
         scene = undrifted(unjumped(grounded(scene, body, fixed), body, fixed), body, fixed, slides)
-    every = max(round(scene.fps / FPS), 1)
+    every, past = max(round(scene.fps / FPS), 1), Past() if begun else None
 
     def by(scene: Scene, first: int, fixed: Tensor | None) -> Scene:
         """Corrected by every so-many-th frame, from `first` on."""
         few = torch.arange(first, scene.frames, every, device=scene.device)
         seen, stay = scene.frames_at(few).replace(fps=scene.fps / every), fixed_in(fixed, few)
-        offset = settling(seen, body, how, stay, settle, begun, slides=slides)
+        offset = settling(seen, body, how, stay, settle, past, slides)
         if settle is None:
-            offset = pressed(seen, body, offset, how, stay, begun, slides)
+            offset = pressed(seen, body, offset, how, stay, past, slides)
         if every > 1:
             offset = between_frames(offset, few, scene.frames)
         if fixed is not None:
@@ -155,11 +156,11 @@ def _between(
 
 
 def pressed(
-    scene: Scene, body: Body, offset: Tensor, how: str, fixed: Tensor | None, begun: bool, slides: float
+    scene: Scene, body: Body, offset: Tensor, how: str, fixed: Tensor | None, past: Past | None, slides: float
 ) -> Tensor:
     """The correction with that of `STUBBORN` around frames in which it leaves people deep. -> (B, T, P, DOFS)
 
-    A scene in which that does not help keeps its own. Arguments as for `repaired`; offset (B, T, P, DOFS).
+    A scene in which that does not help keeps its own. Arguments as for `settling`; offset (B, T, P, DOFS).
     """
     depth = depth_between(corrected(scene, offset), body, fixed)
     stays = depth > CONTACT[FIRM.get(how, how)].measured + STAYS
@@ -168,7 +169,7 @@ def pressed(
         return offset
     few = scene.select(deep)
     still = fixed_of(None if fixed is None else fixed.to(deep.device), deep, scene.scenes)
-    again = settling(few, body, how, still, STUBBORN, begun, slides=slides)
+    again = settling(few, body, how, still, STUBBORN, past_of(past, deep), slides)
     share = eased(stays[deep].to(again), AROUND)
     again = torch.lerp(offset[deep], again, share[..., None, None])
     better = depth_between(corrected(few, again), body, still).amax(dim=1) < depth[deep].amax(dim=1)
@@ -221,54 +222,36 @@ def settling(
     how: str = "firm",
     fixed: Tensor | None = None,
     settle: Settle | None = None,
-    begun: bool = False,
-    past: Tensor | None = None,
+    past: Past | None = None,
     slides: float = SLIDES,
-    holding: Tensor | None = None,
-    last: tuple[Tensor, Tensor] | None = None,
     guess: Tensor | None = None,
 ) -> Tensor:
     """The correction (B, T, P, DOFS) that repairs a scene: people move apart, poses do the rest.
 
-    Arguments as for `repaired`, `correction` and `Wishes.of`, whose `before` is `last` here. Scenes are corrected a few
-    at a time.
+    Arguments as for `repaired` and `correction`. Scenes are corrected a few at a time.
     """
     B, T, P = scene.T_world_root.shape[:3]
-    few = max(POSES // (T * P), 1)
-    made = []
-    for start in range(0, B, few):
-        some = slice(start, start + few)
-        still = fixed_of(fixed, some, B)
-        before, hold, first = (None if each is None else each[some] for each in (past, holding, guess))
-        ends = None if last is None else (last[0][some], last[1][some])
-        made.append(_settling(scene.select(some), body, how, still, settle, begun, before, slides, hold, ends, first))
-    return torch.cat(made)
-
-
-def _settling(
-    scene: Scene,
-    body: Body,
-    how: str,
-    fixed: Tensor | None,
-    settle: Settle | None,
-    begun: bool,
-    past: Tensor | None,
-    slides: float,
-    holding: Tensor | None,
-    last: tuple[Tensor, Tensor] | None,
-    guess: Tensor | None,
-) -> Tensor:
-    held = scene if past is None else corrected(scene, past[:, -1:].expand(-1, scene.frames, -1, -1))
-    toward = kept_apart(body.joints(held), scene.present, fixed, TOO_DEEP[FIRM.get(how, how)], begun, scene.fps)
+    most = max(POSES // (T * P), 1)
+    if most < B:
+        made = []
+        for some in (slice(start, start + most) for start in range(0, B, most)):
+            few = scene.select(some), body, how, fixed_of(fixed, some, B)
+            begin = None if guess is None else guess[some]
+            made.append(settling(*few, settle, past_of(past, some), slides, begin))
+        return torch.cat(made)
+    last = None if past is None or past.offset is None else past.offset[:, -1:].expand(-1, T, -1, -1)
+    joints = body.joints(scene if last is None else corrected(scene, last))
+    keep = TOO_DEEP[FIRM.get(how, how)]
+    toward = kept_apart(joints, scene.present, fixed, keep, past is not None, scene.fps)
     settle = settle or Settle()
-    wishes = Wishes.of(scene, body, how, slides, begun=begun, holding=holding, before=last, takes=settle.takes)
-    first, second = pairs_of(scene.agents, scene.device)
+    wishes = Wishes.of(scene, body, how, slides, past, settle.takes)
+    first, second = pairs_of(P, scene.device)
     left = (toward[:, :, first] - toward[:, :, second]).norm(dim=-1)
     # People who are moved far apart let go of each other's hands.
     wishes = replace(wishes, held=wishes.held & (left < LET_GO)[..., None, None])
     if how == "hold":
         settle = replace(settle, tilt=UPRIGHT)
-    return correction(scene, body, wishes, fixed, settle, begun, past, toward, guess)
+    return correction(scene, body, wishes, fixed, settle, past, toward, guess)
 
 
 def between_frames(offset: Tensor, few: Tensor, frames: int) -> Tensor:

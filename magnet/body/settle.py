@@ -17,6 +17,7 @@ from magnet.body.fixed import fixed_in
 from magnet.body.indices import indices
 from magnet.body.joints import ANKLES, COLLARS, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
 from magnet.body.settle_goals import Goals
+from magnet.body.settle_past import Past
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals
 from magnet.body.settle_steps import Settle, Smoothness, exact_step, solve
 from magnet.body.settle_wishes import Wishes
@@ -119,8 +120,7 @@ def correction(
     wishes: Wishes,
     fixed: Tensor | None = None,
     settle: Settle | None = None,
-    begun: bool = False,
-    past: Tensor | None = None,
+    past: Past | None = None,
     toward: Tensor | None = None,
     guess: Tensor | None = None,
 ) -> Tensor:
@@ -130,11 +130,10 @@ def correction(
         scene: (B, T, P), with shapes of `body`.
         wishes: see `Wishes.of`.
         fixed: (P,), (T, P) or (B, T, P) bool, who must not be moved; None: nobody.
-        begun: the motion continues a past that stays, so corrections grow from 0.
-        past: (B, 2, P, DOFS) corrections of the two frames before, which are continued; None: see `begun`.
+        past: the frames before; None: there are none.
         toward: (B, T, P, 2) metres that people are first moved over the ground: decides who ends on which side.
-        guess: (B, T, P, DOFS) a correction to begin with, 0 where nobody may move; None: the last of `past`, moved
-            `toward` there.
+        guess: (B, T, P, DOFS) a correction to begin with, 0 where nobody may move; None: that of the last frame before,
+            moved `toward` there.
     """
     T = scene.frames
     if T > WINDOW + AHEAD:
@@ -143,11 +142,11 @@ def correction(
             stop = min(start + WINDOW + AHEAD, T)
             stay = fixed_in(fixed, slice(start, stop))
             push, first = (None if each is None else each[:, start:stop] for each in (toward, guess))
-            more = (stay, settle, begun or start > 0, parts[-1][:, -LEAD:] if parts else past, push, first)
-            made = correction(scene.slice(start, stop), body, wishes.slice(start, stop), *more)
-            parts.append(made[:, :WINDOW])
+            before = Past(parts[-1][:, -LEAD:]) if parts else past
+            part = scene.slice(start, stop), body, wishes.slice(start, stop)
+            parts.append(correction(*part, stay, settle, before, push, first)[:, :WINDOW])
         return torch.cat(parts, dim=1)
-    return correct_window(scene, body, wishes, fixed, settle or Settle(), begun, past, toward, guess)
+    return correct_window(scene, body, wishes, fixed, settle or Settle(), past, toward, guess)
 
 
 def correct_window(
@@ -156,8 +155,7 @@ def correct_window(
     wishes: Wishes,
     fixed: Tensor | None,
     settle: Settle,
-    begun: bool,
-    past: Tensor | None,
+    past: Past | None,
     toward: Tensor | None,
     guess: Tensor | None,
 ) -> Tensor:
@@ -170,21 +168,19 @@ def correct_window(
     if not bool(free.any()):
         return offset
     wishes = wishes.of_those(free)
-    ramp = begun and past is None
+    before = None if past is None else past.offset
+    ramp = past is not None and before is None
     if ramp:
-        past = offset.new_zeros(B, LEAD, P, DOFS)
-    smooth = Smoothness(settle, free, past, offset)
+        before = offset.new_zeros(B, LEAD, P, DOFS)
+    smooth = Smoothness(settle, free, before, offset)
     if toward is not None and bool(toward.any()):
         smooth.start = smooth.toward(torch.where(free[..., None], toward, 0.0))
-    if past is not None:
-        offset = torch.where(free[..., None], past[:, -1:], offset)
+    if before is not None:
+        offset = torch.where(free[..., None], before[:, -1:], offset)
     offset = offset + smooth.start if guess is None else guess
     rest = body.rest_joints(scene.betas[:, None])
     capsules = with_measured(fit_capsules(body, scene.betas), rest)
-    few = (free.flatten(1).sum(dim=1) <= SOLVED_AT_ONCE)[
-        :, None, None, None
-    ]  # scene by scene: no scene depends on the others
-    at_once, one_by_one = bool(few.any()), not bool(few.all())
+    few = (free.sum(dim=(1, 2)) <= SOLVED_AT_ONCE).view(B, 1, 1, 1)  # no scene depends on the others
     done = torch.zeros_like(few)
     goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard, settle.swing)
     for _ in range(settle.iterations):
@@ -194,17 +190,26 @@ def correct_window(
         if ramp:
             grown = ((residuals.node // P % T + 1) / RAMP).clamp(max=1.0)
             residuals = residuals._replace(root_weight=residuals.root_weight * grown)
-        first, second = slopes(seen, residuals)
-        step = solve(residuals, first, second, smooth, offset, settle.inner) if one_by_one else offset
-        if at_once:
-            mine = few.flatten()[residuals.node // (T * P)]
-            rows = residuals.kept(mine) if one_by_one else residuals
-            ends = (first[mine], second[mine]) if one_by_one else (first, second)
-            step = torch.where(few, exact_step(rows, *ends, smooth, offset), step)
-        step = torch.where(done, 0.0, step)
+        step = torch.where(done, 0.0, step_of(residuals, *slopes(seen, residuals), smooth, offset, few, settle.inner))
         size = step.abs().amax(dim=(1, 2, 3), keepdim=True)
         offset = offset + step * (settle.most / size.clamp_min(settle.most))
         done = done | (few & (size < SMALL))
         if bool(done.all()):
             break
     return offset
+
+
+def step_of(
+    residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoothness, offset: Tensor, few: Tensor, inner: int
+) -> Tensor:
+    """One Gauss-Newton step: at once in scenes in which `few` poses may move, by conjugate gradients in others.
+
+    few (B, 1, 1, 1) bool; other arguments as for `solve`. -> (B, T, P, DOFS)
+    """
+    if bool(few.all()):
+        return exact_step(residuals, first, second, smooth, offset)
+    step = solve(residuals, first, second, smooth, offset, inner)
+    if not bool(few.any()):
+        return step
+    mine = few.flatten()[residuals.node // (offset.shape[1] * offset.shape[2])]
+    return torch.where(few, exact_step(residuals.kept(mine), first[mine], second[mine], smooth, offset), step)

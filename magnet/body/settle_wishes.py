@@ -14,6 +14,7 @@ from magnet.body.fit import clearance
 from magnet.body.holding import HELD, holds, lasting_holds
 from magnet.body.indices import pairs_of
 from magnet.body.joints import ANKLES, FEET, TOES
+from magnet.body.settle_past import Past
 from magnet.motion.runs import true_runs
 from magnet.motion.scene import Scene
 
@@ -74,9 +75,7 @@ class Wishes:
         body: Body,
         how: str = "firm",
         slides: float = SLIDES,
-        begun: bool = False,
-        holding: Tensor | None = None,
-        before: tuple[Tensor, Tensor] | None = None,
+        past: Past | None = None,
         takes: float = HELD,
     ) -> Wishes:
         """The wishes that a motion (B, T, P) itself shows.
@@ -85,31 +84,28 @@ class Wishes:
             how: a name in `CONTACT`; with `hold` hands that met go on holding (`lasting_holds`), else they keep what is
                 between them in each frame.
             slides: m/s below which a low toe is meant to stand.
-            begun: the first frames continue others; who is in the air then may have jumped.
-            holding: (B, Q, 2, 2) bool, hands that held in the frame before the first.
-            before: joints (B, 1, P, 22, 3) of that frame, uncorrected and corrected; None: feet need not stay where
-                they were.
+            past: the frames before: who is in the air in the first one may have jumped there. None: there are none.
             takes: metres between hands that take hold, with `hold`.
         """
-        joints = body.joints(scene)
+        joints, before = body.joints(scene), past or Past()
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
         there = scene.present[:, None]
-        floats = floating(joints, above, scene.fps, begun) & there
+        floats = floating(joints, above, scene.fps, past is not None) & there
         height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)
         joints = joints.clone()
         joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
         if how == "hold":
-            held, between = lasting_holds(joints, scene.present, scene.fps, holding, takes)
+            held, between = lasting_holds(joints, scene.present, scene.fps, before.holding, takes)
         else:
             held, between = holds(joints, scene.present)
         rest, stood = body.rest_joints(scene.betas), None
         stands = standing_feet(joints, rest, above, scene.fps, slides) & there[..., None]
-        if before is not None:
-            begin = torch.cat([before[0], joints[:, :1]], dim=1)
-            behind = lagging(*(each[:, 0] for each in before))
+        if before.plain is not None and before.shown is not None:
+            begin = torch.cat([before.plain, joints[:, :1]], dim=1)
+            behind = lagging(before.plain[:, 0], before.shown[:, 0])
             stays = standing_feet(begin, rest, above, scene.fps, slides)[:, 0] & ~behind
             stands = stands & ~behind[:, None]
-            stood = torch.where(stays[..., None], before[1][:, 0, :, FEET][..., [0, 2]], torch.nan)
+            stood = torch.where(stays[..., None], before.shown[:, 0, :, FEET][..., [0, 2]], torch.nan)
         on = low_toes(joints, above) & there[..., None]
         kept = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
         heights = torch.where(on, kept, torch.nan)
@@ -120,7 +116,7 @@ class Wishes:
             above,
             stands,
             stood,
-            None if before is None else before[1],
+            before.shown,
             heights,
             highest,
             held,

@@ -49,7 +49,6 @@ class World(Protocol):
     T_world_can: Tensor
     finalized: int
     correction: Corrected | None
-    uncorrected: Scene | None
     chunk_correction: Corrected | None
     there: Tensor
     released: int
@@ -97,10 +96,9 @@ def _settled(world: World, made: Scene, stop: int, how: str, tokens: Tensor, exp
     new = torch.cat([new, after.expand(made.frames - own, -1)])
     seen = 1 + PACE if world.correction is not None else RECALLED
     before = world.given.slice(max(first - seen, 0), first) if first else None
-    uncorrected, world.uncorrected = world.uncorrected, made.slice(own - LEAD, own)
     sees = (world.saw & world.placed[rows].all(dim=0)).to(new.device)
     later = None if expected is None else expectation(world, tokens, stop, made.frames // TOKEN_FRAMES, expected)
-    corrected, world.correction = settled_on(made, before, new, own, sees, how, world.correction, uncorrected, later)
+    corrected, world.correction = settled_on(made, before, new, own, sees, how, world.correction, later)
     return corrected.slice(0, own)
 
 
@@ -117,16 +115,17 @@ def expectation(world: World, tokens: Tensor, stop: int, rows: int, expected: Ah
     begins = world.finalized
     block = stop - begins
 
-    def later(one: int, others: Tensor, shown: Scene, hidden: bool) -> tuple[Scene, Tensor] | None:
+    def later(one: int, others: Tensor, shown: Scene | None) -> tuple[Scene, Tensor] | None:
         if not bool(expected.told[one]):
             return None
         ahead = expected.tokens[:, one]
-        if not hidden:
+        if shown is not None:
             return others_expected(world, tokens, stop, rows - block, ahead, (one, False), others, shown), others
         told = world.placed[max(begins - TOLD, 0) : begins].all(dim=0).to(others.device)
         others = others[told[others]]
-        if expected.within.shape[2] != block or not len(others):
+        if not begins or expected.within.shape[2] != block or not len(others):
             return None
+        shown = world.given.slice(begins * TOKEN_FRAMES - LEAD, begins * TOKEN_FRAMES)
         ahead = torch.cat([expected.within[:, one], ahead], dim=1)
         return others_expected(world, tokens, begins, rows, ahead, (one, True), others, shown), others
 
@@ -229,8 +228,9 @@ def decode_bodies(
     keep = pad(keep, (0, 0, 0, more * TOKEN_FRAMES))
     T_world_can = path_with_expected(world, near, ways, stop + more)[:, frames]
     given = world.given.frames_at(torch.arange(frames.start, frames.stop).clamp(max=world.given.frames - 1))
-    if first and first == world.finalized and world.uncorrected is not None:  # corrections go on by themselves
-        given = cat_time([world.uncorrected, given.slice(lead)])
+    uncorrected = None if world.correction is None else world.correction.uncorrected
+    if first and first == world.finalized and uncorrected is not None:  # corrections go on by themselves
+        given = cat_time([uncorrected, given.slice(lead)])
     if first:  # whoever was not there before does not go on from anywhere
         keep = torch.cat([world.rows_by_frame(world.placed[first - 1 : first])[:lead], keep])
     made = spring_from_given(posed(features, T_world_can, given), given, T_world_can, keep, options.blend).slice(lead)

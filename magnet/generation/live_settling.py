@@ -13,6 +13,7 @@ from magnet.body.apart import Apart
 from magnet.body.holding import lasting_holds
 from magnet.body.repair import settling
 from magnet.body.settle import DOFS, LEAD, Settle, corrected
+from magnet.body.settle_past import Past, past_of
 from magnet.generation.separation import open_body_on
 from magnet.generation.settling import Corrected, carried_on, left_deep, since_held
 from magnet.motion.scene import Scene, cat_time
@@ -57,9 +58,10 @@ LEFT = Apart(body=0.07, arms=0.07)
 THROWN, BEARABLE = 31.0, Apart(body=0.10, arms=0.10)
 """Acceleration of a pelvis, m/s², that no dancer's has: rather than so, somebody is left in another up to this deep."""
 
-Later = Callable[[int, Tensor, Scene, bool], tuple[Scene, Tensor] | None]
-"""How somebody, by number, expects others (p,) int to go on from the two frames (B, LEAD, P) that are shown: after the
-block or, where they are hidden, in it and after it; and of which of them it is known. None: of nobody."""
+Later = Callable[[int, Tensor, Scene | None], tuple[Scene, Tensor] | None]
+"""How somebody, by number, expects others (p,) int to go on after the block from the last two frames of it (B, LEAD, P)
+as shown, or, where they are hidden in it (None), in the block and after it; and of which of them it is known. None: of
+nobody."""
 
 
 def settled_on(
@@ -70,7 +72,6 @@ def settled_on(
     sees: Tensor,
     how: str,
     past: Corrected | None,
-    uncorrected: Scene | None = None,
     later: Later | None = None,
 ) -> tuple[Scene, Corrected]:
     """Bodies of a causal plan's next frames corrected, each by itself, going on from its own last correction.
@@ -84,7 +85,6 @@ def settled_on(
             than `before`.
         how: `light`, `firm` or `hold`.
         past: what the last call returned; None: nothing.
-        uncorrected: the same two frames without them; None: as shown.
         later: how somebody expects others to go on after the block; None: as they went (`carried_on`).
 
     Returns:
@@ -95,42 +95,40 @@ def settled_on(
     shaped = scene.replace(body=body.id, valid=None, given=None).permute_agents(there)
     known = None if before is None else before.replace(body=body.id, valid=None, given=None).permute_agents(there)
     new, sees, who = new[:, there], sees[there][:, there], tuple(there.tolist())
-    earlier = None if past is None else past.offset[:, :, there]
     guess = first_guess(past, there, scene.frames)
     whole, moving = scene.T_world_root.new_zeros(*scene.T_world_root.shape[:3], DOFS), new.any(dim=0)
-    parted = last = led = None
+    last = slice(block - LEAD, block)
+    parted = ends = led = None
     if known is not None:
         led = known.T_world_root[:, -LEAD:, :, :3, 3] if known.frames >= LEAD else None
-        joints = body.joints(known)
-        plain = joints
-        if uncorrected is not None:
-            plain = body.joints(uncorrected.replace(body=body.id).permute_agents(there))
-        last = plain[:, -1:], joints[:, -1:]
+        joints = plain = body.joints(known)
+        if past is not None and past.uncorrected is not None:
+            plain = body.joints(past.uncorrected.replace(body=body.id).permute_agents(there))
         parted = parted_for(known, joints, past, who, block) if how == "hold" else None
-    holding = None if parted is None else parted <= REMEMBERED
+        holding = None if parted is None else parted <= REMEMBERED
+        ends = Past(None if past is None else past.offset[:, :, there], holding, plain[:, -1:], joints[:, -1:])
     turns = (sees & moving).sum(dim=1).argsort(stable=True)  # whoever sees nobody new first
     for number in turns[moving[turns]]:
         one = agents == number
         seen = as_known(shaped, known, one, sees[number], block)
-        for hidden, others in ((False, sees[number]), (True, ~sees[number])):
-            others = others & ~one & shaped.present.any(dim=0)
-            if later is None or not bool(others.any()) or (hidden and before is None):
-                continue
-            if hidden and before is not None:
-                shown = before.slice(before.frames - LEAD)
-            else:
-                shown = corrected(scene.slice(block - LEAD, block), whole[:, block - LEAD : block])
-            seen = as_expected(seen, later(who[number], there[others], shown, hidden), there)
-        own = None if earlier is None else earlier * one[:, None]  # the others are seen as shown, corrected already
-        free, begun = new & one, known is not None
+        others, hidden = sees[number] & ~one, ~sees[number] & ~one
+        if later is not None and bool(others.any()):
+            shown = corrected(scene.slice(last.start, last.stop), whole[:, last])
+            seen = as_expected(seen, later(who[number], there[others], shown), there)
+        if later is not None and bool(hidden.any()):
+            seen = as_expected(seen, later(who[number], there[hidden], None), there)
+        own = ends  # the others are seen as shown, corrected already
+        if own is not None and own.offset is not None:
+            own = own._replace(offset=own.offset * one[:, None])
+        free = new & one
         first = None if guess is None else guess * free[..., None]
-        changes = own_correction(seen, body, how, ~free, begun, own, holding, last, first, led, block)
+        changes = own_correction(seen, body, how, ~free, own, first, led, block)
         whole[:, :, who[number]] = changes[:, :, number]
         if bool((sees[:, number] & moving).any()):  # else nobody asks how it was corrected
             done = corrected(shaped, changes * one[:, None])
             shaped = shaped.replace(body_rot=done.body_rot, T_world_root=done.T_world_root)
     made = corrected(scene, whole)
-    now = Corrected(whole[:, block - LEAD : block], parted, who, whole[:, block:])
+    now = Corrected(whole[:, last], parted, who, whole[:, block:], scene.slice(last.start, last.stop))
     return scene.replace(body_rot=made.body_rot, T_world_root=made.T_world_root), now
 
 
@@ -188,10 +186,7 @@ def own_correction(
     body: Body,
     how: str,
     fixed: Tensor,
-    begun: bool,
-    past: Tensor | None,
-    holding: Tensor | None,
-    last: tuple[Tensor, Tensor] | None,
+    past: Past | None,
     guess: Tensor | None,
     led: Tensor | None,
     block: int,
@@ -201,15 +196,13 @@ def own_correction(
     Arguments as for `magnet.body.repair.settling` and `settled_on`, and `led` (B, LEAD, P, 3), pelvises in the frames
     before; None: there are none. -> (B, T, P, DOFS)
     """
-    offset = settling(seen, body, how, fixed, SHOWN, begun, past, holding=holding, last=last, guess=guess)
+    offset = settling(seen, body, how, fixed, SHOWN, past, guess=guess)
     for harder in PRESSED:
         deep = left_deep(corrected(seen, offset), body, LEFT, fixed).any(dim=1)
         if not bool(deep.any()):
             break
-        before, hold = (None if each is None else each[deep] for each in (past, holding))
-        ends = None if last is None else (last[0][deep], last[1][deep])
         few = seen.select(deep.nonzero()[:, 0])
-        made = settling(few, body, how, fixed, harder, begun, before, holding=hold, last=ends, guess=offset[deep])
+        made = settling(few, body, how, fixed, harder, past_of(past, deep), guess=offset[deep])
         if harder is PRESSED[-1] and led is not None:
             bears = ~left_deep(corrected(few, offset[deep]), body, BEARABLE, fixed).any(dim=1)
             made = torch.where((bears & thrown(few, made, led[deep], block))[:, None, None, None], offset[deep], made)

@@ -11,10 +11,12 @@ from torch.nn.functional import avg_pool1d, max_pool1d
 
 from magnet.body import Body
 from magnet.body.apart import Apart, excess_depth
+from magnet.body.fixed import fixed_of
 from magnet.body.holding import holds
 from magnet.body.indices import pairs_of
 from magnet.body.repair import STUBBORN, repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
+from magnet.body.settle_past import Past, past_of
 from magnet.generation.separation import Decode, open_body_on
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene
@@ -136,6 +138,7 @@ class Corrected(NamedTuple):
     parted: Tensor | None  # (B, Q, 2, 2) frames; 0: they hold; infinite: they never did
     who: tuple[int, ...]  # the slots of these hands, and of a chunk's P people
     ahead: Tensor | None = None  # (B, f, P, DOFS) corrections of frames expected behind a block, a first guess of them
+    uncorrected: Scene | None = None  # (B, 2, P) the last two frames of a block without their corrections
 
 
 @torch.no_grad()
@@ -153,25 +156,23 @@ def settled_chunk(scene: Scene, fixed: Tensor, how: str, past: Corrected | None)
     """
     body = open_body_on(scene.device)
     there = scene.present.any(dim=0).nonzero()[:, 0]
-    who, begun = tuple(there.tolist()), past is not None
+    who = tuple(there.tolist())
     if not who:
         return scene, Corrected(scene.T_world_root.new_zeros(scene.scenes, 2, 0, DOFS), None, who)
-    past = past if past is not None and past.who == who else None  # else somebody has ended, and was given until then
+    before = None if past is None else Past()
+    if past is not None and past.who == who:  # else somebody has ended, and was given until then
+        before = Past(past.offset, None if past.parted is None else past.parted == 0)
     shaped = scene.replace(body=body.id, valid=None, given=None, names=()).permute_agents(there)
-    before, parted = (None, None) if past is None else past[:2]
-    holding = None if parted is None else parted == 0
     still = fixed[..., there.to(fixed.device)]
-    offset = settling(shaped, body, how, still, FINISHED, begun, before, holding=holding)
+    offset = settling(shaped, body, how, still, FINISHED, before)
     made = corrected(shaped, offset)
     for harder in ANEW:
         frames = left_deep(made, body, TOO_DEEP, still)
         deep = frames.any(dim=1)
         if not bool(deep.any()):
             break
-        few = shaped.select(deep.nonzero()[:, 0])
-        stay = still[deep] if still.ndim == 3 and len(still) == len(deep) else still
-        past_few, held_few = (None if each is None else each[deep] for each in (before, holding))
-        again = settling(few, body, how, stay, harder, begun, past_few, holding=held_few)
+        few, stay = shaped.select(deep.nonzero()[:, 0]), fixed_of(still, deep, len(deep))
+        again = settling(few, body, how, stay, harder, past_of(before, deep))
         offset[deep] = torch.lerp(offset[deep], again, around(frames[deep])[..., None, None].to(again))
         made = corrected(shaped, offset)
     held = since_held(holds(body.joints(made), made.present)[0][:, -1:]) if how == "hold" else None

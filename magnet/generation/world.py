@@ -48,7 +48,6 @@ class WorldState(Places):
         self.stats, self.settle = stats, None if options.settle == "off" else options.settle
         self.saw = torch.ones(self.known.shape[1], self.known.shape[1], dtype=torch.bool)  # see `shown_to`
         self.correction: Corrected | None = None  # of the last two frames shown, in causal plans
-        self.uncorrected: Scene | None = None  # the same two frames before they were corrected
         self.chunk_correction: Corrected | None = None  # of the chunk before, in all other plans
         self.couples = Couples(options.together) if options.together and not self.causal else None
         self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little

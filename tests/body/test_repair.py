@@ -278,11 +278,11 @@ def test_depth_that_a_correction_leaves_for_a_moment_is_corrected_again_around_i
     scene = swinging(200)
     left = correction(scene, BODY, Wishes.of(scene, BODY), settle=Settle(hard=1e-4))
     assert float(depths(corrected(scene, left)).max()) > 0.065
-    again = pressed(scene, BODY, left, "firm", None, False, 0.0)
+    again = pressed(scene, BODY, left, "firm", None, None, 0.0)
     assert float(depths(corrected(scene, again)).max()) < 0.05
     assert torch.equal(again[:, :30], left[:, :30]) and torch.equal(again[:, -30:], left[:, -30:])
     kept = torch.tensor([True, True])
-    assert pressed(scene, BODY, left, "firm", kept, False, 0.0) is left, "who does not move is not asked to"
+    assert pressed(scene, BODY, left, "firm", kept, None, 0.0) is left, "who does not move is not asked to"
 
 
 def test_where_nothing_stays_deep_a_scene_is_corrected_once(handshake: Scene) -> None:

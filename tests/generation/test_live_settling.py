@@ -148,12 +148,11 @@ def glided(speed: float, frames: int, block: int = 4) -> tuple[Scene, Scene]:
     root[0, :, 0, 0, 3] += speed * (torch.arange(frames) - block).clamp(min=0) / 30.0
     sliding = still.replace(T_world_root=root)
     new, sees = torch.ones(block + BEHIND, 1, dtype=torch.bool), torch.zeros(1, 1, dtype=torch.bool)
-    shown, past, plain = [sliding.slice(0, block)], None, None
+    shown, past = [sliding.slice(0, block)], None
     for start in range(block, frames - BEHIND, block):
         ahead = sliding.slice(start, start + block + BEHIND)
-        made, now = settled_on(ahead, shown[-1], new, block, sees, "firm", past, plain)
+        made, past = settled_on(ahead, shown[-1], new, block, sees, "firm", past)
         shown.append(made.slice(0, block))
-        past, plain = now, ahead.slice(block - 2, block)
     return cat_time(shown), sliding
 
 
@@ -185,12 +184,11 @@ def walked_on(scenes: int, speed: float, frames: int = 44, block: int = 4) -> Sc
     root[0, :, 0, 0, 3] += speed / 30 * (torch.arange(frames) - block).clamp(min=0)
     walking, body = still.replace(T_world_root=root), load_body()
     new = torch.tensor([True, False]).expand(block + BEHIND, -1)
-    shown, past, plain = [walking.slice(0, block)], None, None
+    shown, past = [walking.slice(0, block)], None
     for start in range(block, frames - BEHIND, block):
         ahead = walking.slice(start, start + block + BEHIND)
-        made, now = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past, plain)
+        made, past = settled_on(ahead, shown[-1], new, block, torch.zeros(2, 2, dtype=torch.bool), "firm", past)
         shown.append(made.slice(0, block))
-        past, plain = now, ahead.slice(block - 2, block)
     return cat_time(shown).replace(body=body.id)
 
 
