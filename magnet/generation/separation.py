@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -24,64 +25,80 @@ def open_body_on(device: torch.device) -> Body:
     return load_body().requires_grad_(False).to(device)
 
 
-@torch.no_grad()
-def separated(
-    decode: Decode,
-    latent: Tensor,
-    deltas: Tensor,
-    T_world_can: Tensor,
-    given: Scene,
-    new: Tensor,
-    how: str,
-    begun: bool,
-    known: Tensor,
-    unseen: Tensor,
-    decentralized: bool = False,
-) -> Tensor:
-    """Canonical frames of some rows of tokens with the new people moved so far that bodies do not collide.
+@dataclass(frozen=True)
+class MadeRows:
+    """Rows of tokens that a stage has finished, and in front of them `lead` rows that they go on from.
 
-    Bodies are those of the open body: its capsules are close enough for any shape numbers and joints.
-
-    Args:
-        decode: the tokenizer's.
-        latent: (B, n, P, C) of the rows.
-        deltas: (B, n, P, 4, 9) of the rows.
+    Attributes:
+        first: number of the first row among those that the world holds.
+        latent: (B, n, P, C).
+        deltas: (B, n, P, 4, 9).
         T_world_can: (B, 4 n, P, 4, 4) where people stand.
         given: (B, 4 n) the rows of the scene: its shapes, who is there, and the poses of those who are known.
         new: (n, P) bool, who may be moved, by row.
-        how: a name in `APART`.
-        begun: the first row is one of before, whence the new ones go on.
         known: (n, P) bool, whose poses are in `given`.
-        unseen: (P,) bool, whose motion the new ones may know no further than the first row: they are taken to stand
-            still from there on.
+        unseen: (P,) bool, whose motion the new ones may know no further than the lead; without one, they are not there.
+        lead: rows.
         decentralized: the new ones do not see each other either; each makes way alone.
+    """
+
+    first: int
+    latent: Tensor
+    deltas: Tensor
+    T_world_can: Tensor
+    given: Scene
+    new: Tensor
+    known: Tensor
+    unseen: Tensor
+    lead: int
+    decentralized: bool
+
+    @property
+    def frames(self) -> slice:
+        """The rows' frames in the world."""
+        return slice(self.first * TOKEN_FRAMES, (self.first + len(self.new)) * TOKEN_FRAMES)
+
+    def bodies(self, decode: Decode, count: int) -> Scene:
+        """Bodies of the first rows, decoded from these alone. -> (B, 4 count, P)"""
+        given = self.given.slice(0, count * TOKEN_FRAMES)
+        poses = decode(self.latent[:, :count], given.betas, self.deltas[:, :count])
+        there = self.known[:count].repeat_interleave(TOKEN_FRAMES, dim=0)
+        made = posed(poses, self.T_world_can[:, : given.frames], given)
+        return made.with_poses(there, given.body_rot, given.T_world_root)
+
+    def views(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Who is moved together, and who is hidden from them. -> (P,) bool twice"""
+        moving, agents = self.new.any(dim=0), torch.arange(self.new.shape[1], device=self.new.device)
+        for who in [agents == agent for agent in agents[moving]] if self.decentralized else [moving]:
+            yield who, self.unseen | (moving & ~who)
+
+
+@torch.no_grad()
+def separated(decode: Decode, rows: MadeRows, how: str) -> Tensor:
+    """Canonical frames of some rows with the new people moved so far that bodies do not collide.
+
+    Bodies are those of the open body: its capsules are close enough for any shape numbers and joints. Who is unseen is
+    taken to stand still after the lead.
+
+    Args:
+        decode: the tokenizer's.
+        rows: with a lead of one row, or none at the beginning of a scene.
+        how: a name in `APART`.
 
     Returns:
         (B, 4 n, P, 4, 4); others stay where they are, bit for bit.
     """
-
-    def bodies(rows: slice) -> Tensor:
-        """Joints in some of the rows, decoded from these alone. -> (B, 4 n, P, 22, 3)"""
-        frames = slice((rows.start or 0) * TOKEN_FRAMES, None if rows.stop is None else rows.stop * TOKEN_FRAMES)
-        recorded = given.frames_at(frames)
-        made = posed(decode(latent[:, rows], given.betas, deltas[:, rows]), T_world_can[:, frames], recorded)
-        body, there = open_body_on(latent.device), known[rows].repeat_interleave(TOKEN_FRAMES, dim=0)
-        real, decoded = (body.joints(scene.replace(body=body.id)) for scene in (recorded, made))
-        return torch.where(there[..., None, None], real, decoded)
-
-    joints, rows = bodies(slice(None)), new.repeat_interleave(TOKEN_FRAMES, dim=0)
-    still = joints
+    body, begun = open_body_on(rows.latent.device), bool(rows.lead)
+    joints = body.joints(rows.bodies(decode, len(rows.new)).replace(body=body.id))
+    still, may = joints, rows.new.repeat_interleave(TOKEN_FRAMES, dim=0)
     if begun:
-        last = bodies(slice(0, 1))[:, -1:]
-        still = torch.cat(
-            [joints[:, :TOKEN_FRAMES], last.expand(-1, joints.shape[1] - TOKEN_FRAMES, -1, -1, -1)], dim=1
-        )
-    moved = torch.zeros_like(T_world_can[..., :2, 3])
-    agents = torch.arange(new.shape[1], device=new.device)
-    for who in [agents == agent for agent in agents[new.any(dim=0)]] if decentralized else [new.any(dim=0)]:
-        hidden = unseen | (new.any(dim=0) & ~who)
-        present = given.present if begun else given.present & ~hidden
+        last = body.joints(rows.bodies(decode, 1).replace(body=body.id))[:, -1:]
+        held = last.expand(-1, joints.shape[1] - TOKEN_FRAMES, -1, -1, -1)
+        still = torch.cat([joints[:, :TOKEN_FRAMES], held], dim=1)
+    moved = torch.zeros_like(rows.T_world_can[..., :2, 3])
+    for who, hidden in rows.views():
+        present = rows.given.present if begun else rows.given.present & ~hidden
         seen = torch.where(hidden[:, None, None], still, joints)
-        moved = moved + kept_apart(seen, present, ~(rows & who), APART[how], begun)
+        moved = moved + kept_apart(seen, present, ~(may & who), APART[how], begun)
     T_new_world = from_planar(torch.zeros_like(moved[..., 0]), moved)
-    return torch.where((moved == 0).all(dim=-1)[..., None, None], T_world_can, T_new_world @ T_world_can)
+    return torch.where((moved == 0).all(dim=-1)[..., None, None], rows.T_world_can, T_new_world @ rows.T_world_can)

@@ -17,8 +17,7 @@ from magnet.body.indices import pairs_of
 from magnet.body.repair import STUBBORN, repaired, settling
 from magnet.body.settle import DOFS, Settle, corrected
 from magnet.body.settle_past import Past, past_of
-from magnet.generation.separation import Decode, open_body_on
-from magnet.motion.frames import posed
+from magnet.generation.separation import Decode, MadeRows, open_body_on
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
 
@@ -72,60 +71,31 @@ def carried_on(scene: Scene, agents: Tensor, frame: int) -> Scene:
     return scene.with_poses(agents, held.body_rot, held.T_world_root)
 
 
-def corrected_in_views(scene: Scene, new: Tensor, unseen: Tensor, how: str, lead: int, decentralized: bool) -> Scene:
-    """Poses of some people corrected, each by what it may see.
-
-    Args:
-        scene: (B, T, P) bodies.
-        new: (T, P) bool, who may be moved.
-        unseen: (P,) bool, whom the new ones may know no further than the first frames: they are carried on from there.
-        how: `light`, `firm` or `hold`.
-        lead: first frames that are a past; 0: none, and whoever is unseen is not there.
-        decentralized: the new ones do not see each other either.
-    """
-    body, agents = open_body_on(scene.device), torch.arange(scene.agents, device=scene.device)
-    shaped = scene.replace(body=body.id, valid=None, given=None)
-    made, moving = shaped, new.any(dim=0)
-    for who in [agents == agent for agent in agents[moving]] if decentralized else [moving]:
-        hidden = unseen | (moving & ~who)
-        seen = carried_on(shaped, hidden, lead - 1) if lead else shaped.replace(present=shaped.present & ~hidden)
-        own = new & who
-        one = repaired(seen, body, how, ~own, BLOCK, begun=bool(lead), slides=0.0, drifting=False)
-        far = (body.joints(one) - body.joints(seen)).norm(dim=-1).amax(dim=(1, 3))  # (B, P)
-        own = own & (far > WORTH)[:, None]
-        made = made.with_poses(own, one.body_rot, one.T_world_root)
-    return made.replace(body=scene.body)
-
-
 @torch.no_grad()
-def settled_block(
-    decode: Decode,
-    latent: Tensor,
-    deltas: Tensor,
-    T_world_can: Tensor,
-    given: Scene,
-    new: Tensor,
-    known: Tensor,
-    unseen: Tensor,
-    how: str,
-    lead: int,
-    decentralized: bool = False,
-) -> tuple[Scene, Scene]:
-    """Bodies of some rows of tokens, as they are and with those of new people corrected.
+def settled_rows(decode: Decode, rows: MadeRows, how: str) -> tuple[Scene, Scene]:
+    """Bodies of some rows of tokens, as they are and with those of new people corrected, each by what it may see.
 
-    Arguments as for `magnet.generation.separation.separated`, and:
+    Who is unseen is taken to go on as before after the lead (`carried_on`).
 
     Args:
-        lead: first rows that are of before, whence the new ones go on.
+        decode: the tokenizer's.
+        rows: with a lead of `LEAD_TOKENS`, or fewer at the beginning of a scene.
+        how: `light`, `firm` or `hold`.
 
     Returns:
         (B, 4 n, P) twice.
     """
-    there = known.repeat_interleave(TOKEN_FRAMES, dim=0)
-    made = posed(decode(latent, given.betas, deltas), T_world_can, given)
-    made = made.with_poses(there, given.body_rot, given.T_world_root)
-    moving = new.repeat_interleave(TOKEN_FRAMES, dim=0)
-    return made, corrected_in_views(made, moving, unseen, how, lead * TOKEN_FRAMES, decentralized)
+    body, lead, begun = open_body_on(rows.latent.device), rows.lead * TOKEN_FRAMES, bool(rows.lead)
+    plain, new = rows.bodies(decode, len(rows.new)), rows.new.repeat_interleave(TOKEN_FRAMES, dim=0)
+    made = shaped = plain.replace(body=body.id, valid=None, given=None)
+    for who, hidden in rows.views():
+        seen = carried_on(shaped, hidden, lead - 1) if begun else shaped.replace(present=shaped.present & ~hidden)
+        own = new & who
+        one = repaired(seen, body, how, ~own, BLOCK, begun, slides=0.0, drifting=False)
+        far = (body.joints(one) - body.joints(seen)).norm(dim=-1).amax(dim=(1, 3))  # (B, P)
+        own = own & (far > WORTH)[:, None]
+        made = made.with_poses(own, one.body_rot, one.T_world_root)
+    return plain, made.replace(body=plain.body)
 
 
 class Corrected(NamedTuple):

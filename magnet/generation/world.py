@@ -12,8 +12,8 @@ from magnet.generation.causal_bodies import finalized_bodies
 from magnet.generation.chunk_bodies import chunk_bodies
 from magnet.generation.couples import LONG, Couples
 from magnet.generation.places import Places
-from magnet.generation.separation import Decode, separated
-from magnet.generation.settling import LEAD_TOKENS, Corrected, settled_block
+from magnet.generation.separation import Decode, MadeRows, separated
+from magnet.generation.settling import LEAD_TOKENS, Corrected, settled_rows
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
@@ -76,10 +76,13 @@ class WorldState(Places):
             self.steer(slice(first, stop), finished[first:stop])
         if self.couples is not None:
             self._lead(self.couples, finished, first, stop)
-        if self.options.apart != "off":
-            self._separate(tokens, latent, finished, first, stop, decentralized)
+        if self.options.apart != "off":  # a row in front tells the decoder where poses come from
+            made = self._made_rows(tokens, latent, finished, first, stop, decentralized, lead=1)
+            decode = self.decode_rows(tokens, made.first, stop)
+            self.T_world_can[:, made.frames] = separated(decode, made, self.options.apart)
         if self.options.settle_blocks and self.settle is not None:
-            latent = self._settle(tokens, latent, finished, first, stop, decentralized)
+            made = self._made_rows(tokens, latent, finished, first, stop, decentralized, LEAD_TOKENS)
+            latent = self._settle(made)
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
             latent = torch.cat([self.model.parts_of(tokens[:, begin:first])[0], latent], dim=1)
@@ -138,58 +141,41 @@ class WorldState(Places):
         now = self.T_world_can[:, frames]
         self.T_world_can[:, frames] = torch.where(led, T_new_world @ now, now)
 
-    def _separate(
-        self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
-    ) -> None:
-        """Move the newly placed out of others' bodies, but for those on their way to a keyframe."""
-        lead = min(1, first)  # a row more in front, so that the decoder knows where poses come from
-        latent, new, known = self._with_lead(lead, tokens, latent, finished, first, stop)
-        low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-        self.T_world_can[:, frames] = separated(
-            self.decode_rows(tokens, low, stop),
+    def _settle(self, rows: MadeRows) -> Tensor:
+        """Correct the poses of the newly placed, and make them what the model goes on from. -> latents (B, n, P, C)"""
+        assert self.settle is not None
+        plain, made = settled_rows(self.model.tokenizer.decode, rows, self.settle)
+        moved = (made.T_world_root != plain.T_world_root).flatten(3).any(-1)
+        moves = rows.new & moved.unflatten(1, (-1, TOKEN_FRAMES)).any(2)
+        frame = moves.repeat_interleave(TOKEN_FRAMES, dim=1)[..., None, None]
+        self.T_world_can[:, rows.frames] = torch.where(frame, canonical_frame(made.T_world_root), rows.T_world_can)
+        changed = self.model.encode(made) - self.model.encode(plain)  # what encoding itself loses stays as it was
+        return torch.where(moves[..., None], rows.latent + changed, rows.latent)[:, rows.lead :]
+
+    def _made_rows(
+        self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool, lead: int
+    ) -> MadeRows:
+        """The rows [first, stop) that a stage has finished, with so many in front, or fewer where there are fewer.
+
+        Of those on their way to a keyframe nobody counts as new: they have to arrive. latent (B, n, P, C) of the rows
+        """
+        low = max(first - lead, 0)
+        if low < first:
+            latent = torch.cat([self.model.parts_of(tokens[:, low:first])[0], latent], dim=1)
+        new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
+        frames, device = slice(low * TOKEN_FRAMES, stop * TOKEN_FRAMES), latent.device
+        return MadeRows(
+            low,
             latent,
             self.placed_deltas(low, stop),
             self.T_world_can[:, frames],
             self.given.slice(frames.start, frames.stop),
-            new,
-            self.options.apart,
-            bool(lead),
-            known,
-            self._unseen(first).to(latent.device),
+            new.to(device),
+            self.known[low:stop].to(device),
+            self._unseen(first).to(device),
+            first - low,
             decentralized,
         )
-
-    def _settle(
-        self, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int, decentralized: bool
-    ) -> Tensor:
-        """Correct the poses of the newly placed, and make them what the model goes on from. -> latents (B, n, P, C)"""
-        assert self.settle is not None
-        lead = min(LEAD_TOKENS, first)
-        latent, new, known = self._with_lead(lead, tokens, latent, finished, first, stop)
-        low, frames = first - lead, slice((first - lead) * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-        T_world_can, unseen = self.T_world_can[:, frames], self._unseen(first).to(latent.device)
-        rest = self.given.slice(frames.start, frames.stop), new, known, unseen, self.settle, lead, decentralized
-        deltas = self.placed_deltas(low, stop)
-        plain, made = settled_block(self.model.tokenizer.decode, latent, deltas, T_world_can, *rest)
-        moved = (made.T_world_root != plain.T_world_root).flatten(3).any(-1)
-        moves = new & moved.unflatten(1, (-1, TOKEN_FRAMES)).any(2)
-        frame = moves.repeat_interleave(TOKEN_FRAMES, dim=1)[..., None, None]
-        self.T_world_can[:, frames] = torch.where(frame, canonical_frame(made.T_world_root), T_world_can)
-        changed = self.model.encode(made) - self.model.encode(plain)  # what encoding itself loses stays as it was
-        return torch.where(moves[..., None], latent + changed, latent)[:, lead:]
-
-    def _with_lead(
-        self, lead: int, tokens: Tensor, latent: Tensor, finished: Tensor, first: int, stop: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """So many rows more in front: latents (B, n, P, C), who is newly placed, who is known (n, P) bool.
-
-        Of those on their way to a keyframe nobody counts as new: they have to arrive.
-        """
-        if lead:
-            latent = torch.cat([self.model.parts_of(tokens[:, first - lead : first])[0], latent], dim=1)
-        low = first - lead
-        new = finished[low:stop] & ~self.known[stop] if stop < len(self.known) else finished[low:stop]
-        return latent, new.to(latent.device), self.known[low:stop].to(latent.device)
 
     def _enter(self, tokens: Tensor, first: int, stop: int) -> Tensor:
         """Write the delta into known tokens whose gap before them has just been closed."""
