@@ -2,38 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from magnet.body import Body
 from magnet.body.joints import WRISTS
+from magnet.denoiser.token_core import TokenModelCore
 from magnet.motion.frames import partners, pose_features
 from magnet.motion.scene import FPS, Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, pairwise_by_frame
 from magnet.sampling.noise import alpha_bar
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.losses import length, masked_mean, matrices, moved, world_velocity
-from magnet.tokenizer.normalizer import Normalizer
 from magnet.waiting import may_look
 
 BODY_LOSSES = ("joint", "velocity", "partner", "hands")
 
-
 WITHIN_REACH = 0.4
 """Metres: only wrists that were recorded nearer to each other than this count in `hands`."""
 
-Decode = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""latent (B, N, P, C), betas (B, P, 10), deltas (B, N, P, 4, 9) -> poses (B, T, P, 135)"""
-Joints = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Forward kinematics: body_rot, T_frame_root, betas -> joints (..., 22, 3) in that frame"""
-
 
 def decoded_losses(
-    tokenizer: PoseTokenizer,
-    normalizer: Normalizer,
-    layout: TokenLayout,
+    model: TokenModelCore,
     body: Body,
     clean: Tensor,
     tokens: Tensor,
@@ -45,9 +35,7 @@ def decoded_losses(
     """`body_losses` on the least noisy scenes of a batch.
 
     Args:
-        tokenizer: decodes; frozen.
-        normalizer: of the tokens.
-        layout: of the tokens.
+        model: whose frozen tokenizer decodes.
         body: whose joints are compared, on the tokens' device.
         clean: (B, N, P, D) predicted tokens, normalized.
         tokens: (B, N, P, D) the true ones in real units.
@@ -59,32 +47,30 @@ def decoded_losses(
     signal = alpha_bar(levels)
     chosen = least_noisy(signal, there, max(1, round(share * len(clean))))
     few, kind = scene.select(chosen), clean.device.type
-    dtype, half = torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
-    people, true_pose, seen = few.present, pose_features(few), may_look(clean.device)
-
-    def decode(latent: Tensor, betas: Tensor, deltas: Tensor) -> Tensor:
-        """Poses of those who are there; empty slots stay as they are, and on a CPU cost nothing."""
-        by_slot = (latent.transpose(1, 2), betas, deltas.transpose(1, 2))
-        by_person = [x[people] if seen else x.flatten(0, 1) for x in by_slot]
-        with torch.autocast(kind, dtype, half):  # only networks may run in half precision
-            decoded = tokenizer.decode(by_person[0][:, :, None], by_person[1][:, None], by_person[2][:, :, None])
-        poses, decoded = true_pose.transpose(1, 2), decoded[:, :, 0].float()
-        if seen:
-            return poses.index_put((people,), decoded).transpose(1, 2)
-        return torch.where(people[..., None, None], decoded.view_as(poses), poses).transpose(1, 2)
-
+    half = kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind)
     with torch.autocast(kind, enabled=False):
-        return body_losses(
-            normalizer.denormalize(clean[chosen]),
-            tokens[chosen],
-            true_pose,
-            few.betas,
-            signal[chosen],
-            there[chosen],
-            layout,
-            decode,
-            body.forward_kinematics,
-        )
+        predicted = model.normalizer.denormalize(clean[chosen])
+        latent, deltas, _ = model.layout.unpack(predicted)
+        real = pose_features(few)
+        with torch.autocast(*half):  # only networks may run in half precision
+            pose = decoded_people(model.tokenizer, latent, deltas, few, real)
+        mine, true = (body.forward_kinematics(*matrices(each), few.betas[:, None]) for each in (pose, real))
+        return body_losses(predicted, tokens[chosen], mine, true, signal[chosen], there[chosen], model.layout)
+
+
+def decoded_people(tokenizer: PoseTokenizer, latent: Tensor, deltas: Tensor, scene: Scene, pose: Tensor) -> Tensor:
+    """Poses (B, T, P, 135) with those of people who are there decoded; empty slots stay, and on a CPU cost nothing.
+
+    latent (B, N, P, C), deltas (B, N, P, 4, 9)
+    """
+    people, seen = scene.present, may_look(pose.device)
+    by_slot = (latent.transpose(1, 2), scene.betas, deltas.transpose(1, 2))
+    by_person = [x[people] if seen else x.flatten(0, 1) for x in by_slot]
+    made = tokenizer.decode(by_person[0][:, :, None], by_person[1][:, None], by_person[2][:, :, None])
+    poses, made = pose.transpose(1, 2), made[:, :, 0].float()
+    if seen:
+        return poses.index_put((people,), made).transpose(1, 2)
+    return torch.where(people[..., None, None], made.view_as(poses), poses).transpose(1, 2)
 
 
 def least_noisy(signal: Tensor, there: Tensor, count: int) -> Tensor:
@@ -98,39 +84,26 @@ def least_noisy(signal: Tensor, there: Tensor, count: int) -> Tensor:
 
 
 def body_losses(
-    tokens: Tensor,
-    truth: Tensor,
-    true_pose: Tensor,
-    betas: Tensor,
-    signal: Tensor,
-    there: Tensor,
-    layout: TokenLayout,
-    decode: Decode,
-    joints: Joints,
+    tokens: Tensor, truth: Tensor, mine: Tensor, real: Tensor, signal: Tensor, there: Tensor, layout: TokenLayout
 ) -> dict[str, Tensor]:
     """Errors of decoded bodies, each weighted by how little noise the tokens had.
 
     Args:
-        tokens: (B, N, P, D) predicted, in real units.
-        truth: (B, N, P, D) the same of the recording; its latents are not read.
-        true_pose: (B, T, P, 135) of the recording.
-        betas: (B, P, 10).
+        tokens: (B, N, P, D) predicted, in real units; latents are not read.
+        truth: the same of the recording.
+        mine: (B, T, P, 22, 3) joints decoded from `tokens`, each person's in the own canonical frame, metres.
+        real: the same of the recording.
         signal: (B, N, P) share of signal of the noisy tokens.
         there: (B, N, P, 1 + slots) bool, as in `token_losses`.
         layout: of the tokens.
-        decode: the frozen tokenizer's.
-        joints: of the body.
 
     Returns:
         joint: distance of joints in one's own canonical frame, metres. velocity: error of the joints' velocities over
         the ground, m/s. partner: distance of the partners' joints as seen from one's own frame, metres. hands: error
         of the vectors from one's own wrists to a partner's that were recorded within reach, metres.
     """
-    latent, deltas, pairs = layout.unpack(tokens)
+    _, deltas, pairs = layout.unpack(tokens)
     _, true_deltas, true_pairs = layout.unpack(truth)
-    shape = betas[:, None]
-    mine = joints(*matrices(decode(latent, betas, deltas)), shape)  # (B, T, P, 22, 3)
-    real = joints(*matrices(true_pose), shape)
     weight = signal.repeat_interleave(TOKEN_FRAMES, dim=1)  # (B, T, P)
     counts = there.repeat_interleave(TOKEN_FRAMES, dim=1)
     own = counts[..., 0]

@@ -212,8 +212,8 @@ class Denoiser(DenoiserCore, TokenModel):
                 losses["unfused"] = self._unfused(own.float(), tokens, truth, there, group_levels, snr)
                 total = total + weight.unfused * losses["unfused"]
         if any(getattr(weight, name) for name in BODY_LOSSES):
-            parts = (self.tokenizer, self.normalizer, layout, self.require_body())
-            bodies = decoded_losses(*parts, clean, tokens, levels, scene, there, weight.decoded_share)
+            batch = clean, tokens, levels, scene, there
+            bodies = decoded_losses(self, self.require_body(), *batch, weight.decoded_share)
             total = total + sum(getattr(weight, name) * value for name, value in bodies.items())
             losses |= bodies
         return {"loss": total, **losses}
@@ -240,11 +240,8 @@ class Denoiser(DenoiserCore, TokenModel):
     ) -> Tensor:
         if not (self.training and self.self_forcing.share):
             return truth
-        requantize = self.tokenizer.requantize if self.quantized else None
-        parts = (self.denoise, requantize, self.normalizer, self.layout)
-        options, shift = self.self_forcing, self.noise.shift
         faint = FAINT if self.noise.faint_past else 0
-        shown = with_self_forcing(*parts, truth, levels, scene, options, generator, shift, cond, faint)
+        shown = with_self_forcing(self, truth, levels, scene, self.self_forcing, generator, cond, faint)
         if shown is truth and is_sharded(self.transformer):  # nobody ran it; processes must run shards equally often
             self.denoise(truth[:1], levels[:1], scene.present[:1], None if cond is None else cond[:1])
         return shown

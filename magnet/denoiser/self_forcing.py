@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from magnet.denoiser.core import DenoiserCore
 from magnet.denoiser.options import SelfForcing
 from magnet.motion.frames import canonical_frame, from_9d, from_planar, pairwise, partners, project_se2
 from magnet.motion.placement import place
 from magnet.motion.resample import smoothstep
 from magnet.motion.scene import Scene, concatenate
-from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, by_frame, transforms
+from magnet.motion.tokens import TOKEN_FRAMES, by_frame, transforms
 from magnet.sampling.noise import LEVELS, add_noise, shifted
-from magnet.tokenizer.normalizer import Normalizer
 from magnet.waiting import may_look
-
-Denoise = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
-"""noisy (B, N, P, D), levels (B, N, P), present (B, P), condition (B, ...) -> clean (B, N, P, D), all normalized"""
 
 MOST_NOISE, LEAST_NOISE = 0.75, 0.1
 """Between which of the even levels, as shares of K, a past is made noisy before the model restores it."""
@@ -104,16 +100,12 @@ def past_of(levels: Tensor, faint: int) -> Tensor:
 
 @torch.no_grad()
 def with_self_forcing(
-    denoise: Denoise,
-    requantize: Callable[[Tensor], Tensor] | None,
-    normalizer: Normalizer,
-    layout: TokenLayout,
+    model: DenoiserCore,
     truth: Tensor,
     levels: Tensor,
     scene: Scene,
     options: SelfForcing,
     generator: torch.Generator,
-    shift: float = 1.0,
     cond: Tensor | None = None,
     faint: int = 0,
 ) -> Tensor:
@@ -124,30 +116,29 @@ def with_self_forcing(
     where they stood to each other, so that what follows, which is still the truth, does not begin with a jump.
 
     Args:
-        denoise: the model.
-        requantize: latents to their nearest codes; None: they stay as they are.
-        normalizer, layout: of the tokens.
-        truth, levels: (B, N, P, D) normalized, and (B, N, P) int, which say what a past is: `past_of`.
+        model: whose work the pasts are.
+        truth: (B, N, P, D) normalized.
+        levels: (B, N, P) int, which say what a past is: `past_of`.
         scene: the same scenes, of P agents.
         options: the share of scenes, and how a past is placed.
         generator: of all randomness.
-        shift: of the added noise, see `magnet.sampling.noise.shifted`.
-        cond, faint: condition of the scenes; highest level of a past that is shown a little noisy.
+        cond: condition of the scenes.
+        faint: highest level of a past that is shown a little noisy.
 
     Returns:
         (B, N, P, D).
     """
-    past = past_of(levels, faint)
+    layout, normalizer, past = model.layout, model.normalizer, past_of(levels, faint)
     few = _some(past, options.share, generator)
     if isinstance(few, Tensor) and not len(few):
         return truth
     past, T_world_can = past[few], canonical_frame(scene.T_world_root[few])
     drawn = torch.rand(len(past), 1, 1, generator=generator, device=levels.device)
     even = LEAST_NOISE + (MOST_NOISE - LEAST_NOISE) * drawn
-    renoised = torch.where(past, shifted((even * LEVELS).long(), shift), levels[few])
+    renoised = torch.where(past, shifted((even * LEVELS).long(), model.noise.shift), levels[few])
     noise = torch.randn(truth[few].shape, generator=generator, device=truth.device)
     noisy = add_noise(truth[few], noise, layout.spread(layout.group_levels(renoised)))
-    restored = denoise(noisy, renoised, scene.present[few], None if cond is None else cond[few]).float()
+    restored = model.denoise(noisy, renoised, scene.present[few], None if cond is None else cond[few]).float()
     with torch.autocast(truth.device.type, enabled=False):
         latent, deltas, _ = layout.unpack(normalizer.denormalize(restored))
         own = by_frame(past[..., None, None].expand(*past.shape, deltas.shape[-2], 1))[..., 0]  # (b, T, P)
@@ -162,7 +153,7 @@ def with_self_forcing(
             present=scene.present[few],
         )
         T_world_can = torch.where(own[..., None, None], placed, T_world_can)
-        latent = latent if requantize is None else requantize(latent)
+        latent = model.tokenizer.requantize(latent) if model.quantized else latent
         made = normalizer.normalize(layout.pack(latent, *transforms(T_world_can)))
     moved = past[..., None]
     if layout.slots:  # a pairwise transform moves with either of its ends, where it is shown at all

@@ -8,6 +8,7 @@ from magnet.motion.frames import canonical_frame, inverse, pose_features
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TokenLayout, scene_transforms
 from magnet.testing import random_scene, tiny_denoiser
+from magnet.tokenizer.losses import matrices
 
 LAYOUT = TokenLayout(latent=8, agents=3)
 
@@ -26,17 +27,8 @@ def run(body, seen: Scene, real: Scene, signal: float = 1.0, there: torch.Tensor
     """Losses where the tokens say and the decoder decodes what `seen` is, and `real` was recorded."""
     tokens, truth = tokens_of(seen), tokens_of(real)
     counts = torch.ones(*tokens.shape[:3], 3, dtype=torch.bool) if there is None else there
-    return body_losses(
-        tokens,
-        truth,
-        pose_features(real),
-        real.betas,
-        torch.full(tokens.shape[:3], signal),
-        counts,
-        LAYOUT,
-        lambda latent, betas, deltas: pose_features(seen),
-        body.forward_kinematics,
-    )
+    joints = [body.forward_kinematics(*matrices(pose_features(each)), real.betas[:, None]) for each in (seen, real)]
+    return body_losses(tokens, truth, *joints, torch.full(tokens.shape[:3], signal), counts, LAYOUT)
 
 
 def test_the_truth_costs_nothing(body, generator):

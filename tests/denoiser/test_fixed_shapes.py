@@ -97,9 +97,8 @@ def test_off_a_cpu_the_first_scenes_live_on_pasts_of_the_models_own(scene: Scene
     levels = torch.full((6, N, 3), 500)
     levels[:, :3] = 0
     levels[1] = 500  # no past
-    parts = (model.denoise, model.tokenizer.requantize, model.normalizer, model.layout)
     with as_off_cpu():
         generator = torch.Generator().manual_seed(0)
-        changed = with_self_forcing(*parts, truth, levels, scene, SelfForcing(0.5), generator) != truth
+        changed = with_self_forcing(model, truth, levels, scene, SelfForcing(0.5), generator) != truth
     assert changed.flatten(1).any(dim=1).tolist() == [True, False, True, False, False, False]
     assert not changed[:, 4:, :, : model.layout.latent].any()  # a transform into the next token moves with its past

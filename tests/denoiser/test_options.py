@@ -137,8 +137,7 @@ def test_a_past_of_ones_own_is_continuous_too(continuous: Denoiser):
     levels = torch.full((4, 8, 3), 700)
     levels[:, :4] = 0
     truth = continuous.normalizer.normalize(continuous.tokenize(scene)[0])
-    parts = (continuous.denoise, None, continuous.normalizer, continuous.layout)
-    made = with_self_forcing(*parts, truth, levels, scene, SelfForcing(1.0), torch.Generator().manual_seed(1))
+    made = with_self_forcing(continuous, truth, levels, scene, SelfForcing(1.0), torch.Generator().manual_seed(1))
     latent = continuous.layout.unpack(continuous.normalizer.denormalize(made))[0][:, :4]
     assert (continuous.tokenizer.requantize(latent) - latent).abs().amax(dim=-1).min() > 1e-3
 

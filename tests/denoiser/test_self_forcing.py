@@ -27,8 +27,7 @@ def scene():
 def shown(model, scene, levels, share=1.0, seed=1, faint=0):
     truth = model.normalizer.normalize(model.tokenize(scene)[0])
     generator = torch.Generator().manual_seed(seed)
-    parts = (model.denoise, model.tokenizer.requantize, model.normalizer, model.layout)
-    return truth, with_self_forcing(*parts, truth, levels, scene, SelfForcing(share), generator, faint=faint)
+    return truth, with_self_forcing(model, truth, levels, scene, SelfForcing(share), generator, faint=faint)
 
 
 def rolled_out() -> torch.Tensor:
