@@ -49,7 +49,8 @@ class World(Protocol):
     T_world_can: Tensor
     finalized: int
     correction: Corrected | None
-    chunk_correction: Corrected | None
+    chunk_corrections: dict[str, Corrected]
+    hows: list[str]
     there: Tensor
     released: int
     decoder: Carried

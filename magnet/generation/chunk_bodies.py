@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from magnet.generation.blending import crossfade_given, freeze_after, smoothed_path
@@ -9,7 +10,7 @@ from magnet.generation.causal_bodies import World, decoded_frames
 from magnet.generation.conditioning import receptive_field, require_finite
 from magnet.generation.settling import settled_chunk
 from magnet.motion.frames import posed
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
 
 
@@ -41,9 +42,22 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
         goes_on = placed.all(dim=0).to(tokens.device)
         seen = made.replace(present=made.present & goes_on)  # nobody makes way for whom nothing is known of
         fixed = world.rows_by_frame(known[first:stop])
-        corrected, world.chunk_correction = settled_chunk(seen, fixed, world.settle, world.chunk_correction)
-        made = corrected.replace(present=made.present)
+        made = corrected_alike(world, seen, fixed).replace(present=made.present)
     return freeze_after(made, world.rows_by_frame(placed), before)
+
+
+def corrected_alike(world: World, scene: Scene, fixed: Tensor) -> Scene:
+    """Bodies of a chunk corrected, scenes together that are corrected in the same way. fixed (T, P) bool"""
+    before = world.chunk_corrections
+    parts: list[Scene] = []
+    order: list[int] = []
+    for how in sorted(set(world.hows)):
+        rows = [b for b, each in enumerate(world.hows) if each == how]
+        few = scene if len(rows) == scene.scenes else scene.select(rows)
+        part, before[how] = settled_chunk(few, fixed, how, before.get(how))
+        parts.append(part)
+        order += rows
+    return parts[0] if len(parts) == 1 else concatenate(parts).select(torch.tensor(order).argsort().tolist())
 
 
 def shown_path(world: World, first: int, stop: int) -> Tensor:

@@ -42,7 +42,7 @@ from magnet.precision import dtype_of
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
-from magnet.sampling.options import SamplerOptions
+from magnet.sampling.options import SamplerOptions, Settling
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
@@ -212,7 +212,10 @@ class Rollout:
         self.there: float = self.length
         self.expected = Expected(receptive_field(model)[1])
         self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
-        self.world = WorldState(model, self._given(0, 0), schedule, o, samples, stats)
+        # Couples hold hands. Three and more from nothing walk in circles, clap and part.
+        unsaid = (options is None or options.settle is None) and not bool(self.known.any())
+        groups: Settling | None = "firm" if unsaid and o.settle == "hold" else None
+        self.world = WorldState(model, self._given(0, 0), schedule, o, samples, stats, groups)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
         self.body_guidance = None if o.body_guidance == "off" else BodyGuidance.of(self.world, grid)

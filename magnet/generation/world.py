@@ -19,7 +19,7 @@ from magnet.motion.frames import canonical_frame, from_planar, pairwise, to_9d
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
 from magnet.sampling.faint import shown_clean
-from magnet.sampling.options import SamplerOptions
+from magnet.sampling.options import SamplerOptions, Settling
 from magnet.sampling.schedule import MaskSchedule
 from magnet.tokenizer.carried import Carried
 
@@ -33,6 +33,7 @@ class WorldState(Places):
     Args:
         model, given, schedule, options, samples: see `Places`.
         stats: filled, where given.
+        groups: how scenes of three and more people are corrected (`settle`), chunk by chunk; None: as all others.
     """
 
     def __init__(
@@ -43,12 +44,15 @@ class WorldState(Places):
         options: SamplerOptions,
         samples: int,
         stats: SamplingStats | None = None,
+        groups: Settling | None = None,
     ) -> None:
         super().__init__(model, given, schedule, options, samples)
         self.stats, self.settle = stats, None if options.settle == "off" else options.settle
+        people = self.given.present.sum(dim=1).tolist()
+        self.hows: list[str] = [(groups if groups and count > 2 else self.settle) or "off" for count in people]
         self.saw = torch.ones(self.known.shape[1], self.known.shape[1], dtype=torch.bool)  # see `shown_to`
         self.correction: Corrected | None = None  # of the last two frames shown, in causal plans
-        self.chunk_correction: Corrected | None = None  # of the chunk before, in all other plans
+        self.chunk_corrections: dict[str, Corrected] = {}  # of the chunk before, in all other plans, by how it was done
         self.couples = Couples(options.together) if options.together and not self.causal else None
         self.steer: Callable[[slice, Tensor], None] | None = None  # of a crowd: moves the newly placed a little
         self.decode_rows: Callable[[Tensor, int, int], Decode] = lambda tokens, first, stop: model.tokenizer.decode

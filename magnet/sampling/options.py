@@ -73,8 +73,9 @@ class SamplerOptions:
             (`magnet.body.energy`) in the last third of each token's denoising steps (ours): `off`, `light` or `firm`.
         settle: correct poses by damped least squares (ours, `magnet.body.settle`): people out of each other and of
             themselves, hands held, feet still and on the floor. `light` lets people lean on each other, `firm` leaves
-            them touch; with `hold`, firm too, hands that met hold until they are 60 cm apart. None: as the model
-            is best sampled, or `off`, as in streams and for a live partner (docs/corrections.md).
+            them touch; with `hold`, firm too, hands that met hold until they are 60 cm apart. None: as the model is
+            best sampled (three and more from nothing with `firm` in place of `hold`), or `off`, as in streams and for a
+            live partner (docs/corrections.md).
         smooth_path: average where people stand on the floor with the frames before and after (1 : 2 : 1), which stops
             the trembling of models with `network.skip` (ours); where frames are final as they are made, as in turns,
             the one after the last is as it is expected. And people go on as fast as they went from what is given, and

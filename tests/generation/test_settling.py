@@ -17,20 +17,21 @@ from magnet.body.energy import CONTACT
 from magnet.body.holding import holds
 from magnet.body.settle import DOFS
 from magnet.body.settle_wishes import FIRM
-from magnet.generation import settling
+from magnet.generation import chunk_bodies, settling
 from magnet.generation.body_guidance import FARTHEST, STEP
 from magnet.generation.causal_bodies import EXPECTED
-from magnet.generation.rollout import generate
+from magnet.generation.rollout import generate, stream
 from magnet.generation.settling import (
     FINISHED,
     GLIDE,
     PACE,
+    Corrected,
     around,
     carried_on,
     settled_chunk,
 )
 from magnet.metrics import hand_distance
-from magnet.motion.scene import Scene
+from magnet.motion.scene import Scene, cat_time
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions, Separation, Settling
 from magnet.sampling.schedule import Grid
@@ -212,6 +213,43 @@ def test_people_who_may_not_be_moved_are_not_corrected_anew(monkeypatch) -> None
     monkeypatch.setattr(settling, "settling", lambda *words, **more: calls.append(1) or plain(*words, **more))
     settled_chunk(scene, fixed, "firm", None)
     assert len(calls) == 1
+
+
+@pytest.mark.parametrize("chunk", [3, 100])
+def test_groups_from_nothing_hold_hands_only_where_that_is_asked_for(model, monkeypatch, chunk) -> None:
+    """Couples hold as the model is best sampled, in whatever batch; three who go on from a past do, too."""
+    monkeypatch.setattr(model, "sampling", replace(model.sampling, settle="hold"))
+    asked: list[tuple[str, int]] = []
+    plain = chunk_bodies.settled_chunk
+
+    def settled(scene: Scene, fixed: torch.Tensor, how: str, past: Corrected | None) -> tuple[Scene, Corrected]:
+        asked.append((how, scene.scenes))
+        assert past is None or len(past.offset) == scene.scenes
+        return plain(scene, fixed, how, past)
+
+    monkeypatch.setattr(chunk_bodies, "settled_chunk", settled)
+    present = torch.tensor([[True, True, True], [True, True, False], [True, True, True]])
+    scene = random_scene(3, 24, 3, torch.Generator().manual_seed(2), present)
+
+    def made(scene: Scene, task: str, seeds: list[int], settle: Settling | None = None) -> Scene:
+        asked.clear()
+        options, context = SamplerOptions(steps=2, stride=2, settle=settle), 0 if task == "generation" else 16
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        more = (context, 24 - context, 1, options, generators)
+        return cat_time(list(stream(model, scene, registry.get(task)(), *more, chunk=chunk)))
+
+    mixed = made(scene, "generation", [0, 1, 2])
+    assert sorted(set(asked)) == [("firm", 2), ("hold", 1)]
+    plainly = made(scene, "generation", [0, 1, 2], "off")
+    far = (mixed.T_world_root[:, None] - plainly.T_world_root).flatten(2).norm(dim=-1)  # (3, 3)
+    assert far.argmin(dim=1).tolist() == [0, 1, 2], "in their order"
+    for b, how in enumerate(("firm", "hold", "firm")):
+        made(scene.select([b]), "generation", [b])
+        assert set(asked) == {(how, 1)} and len(asked) == (2 if chunk == 3 else 1)
+    made(scene, "generation", [0, 1, 2], "hold")
+    assert set(asked) == {("hold", 3)}
+    made(scene, "joint_future", [0, 1, 2])
+    assert set(asked) == {("hold", 3)}
 
 
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
