@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 import time
@@ -27,6 +28,8 @@ MOST = 0.005
 """Seconds that are taken up with each token, at most."""
 LOST = 1.0
 """Seconds behind after which one's own clock is set anew, and after which one goes on where the others are."""
+RECENT = 32
+"""Tokens, four seconds, of which what they took says what the next one takes."""
 AWAY = GONE / FPS
 """Seconds after which who has told nothing counts no longer."""
 
@@ -109,6 +112,10 @@ class Report:
     speed: float = 1.0
     took: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=10_000))
+
+    def cost(self) -> float:
+        """Seconds that a token takes as things are: the middle of the last ones."""
+        return statistics.median(itertools.islice(reversed(self.took), RECENT)) if self.took else 0.0
 
     def told(self, member: Member, gate: Gate, pace: Pace | None) -> dict[str, Any]:
         """All counts, JSON-ready."""
@@ -267,7 +274,7 @@ class Process:
 
     def turn(self) -> bool:
         """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
-        member, pace, cost = self.member, self.pace, statistics.median(self.report.took or [0.0])
+        member, pace, cost = self.member, self.pace, self.report.cost()
         assert pace is not None
         if self.real_time and ((there := self._there()) - member.next) * PERIOD > LOST:
             member.join(there + 1)  # too slow for them all the time, or stopped for a while

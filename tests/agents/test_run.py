@@ -210,6 +210,35 @@ def test_what_others_tell_of_oneself_counts_only_until_one_has_begun():
     assert not member.come(1, 40) and process.gate.taken == 3
 
 
+class Slower(Player):
+    """Waits for somebody who never tells anything; from token 400 on a token takes it six times as long as before."""
+
+    line: Line
+
+    def awaited(self) -> list[int]:
+        return [0]
+
+    def step(self) -> Message | None:
+        self.line.now += 0.01 if self.next < 400 else 0.06
+        return super().step()
+
+
+def test_who_becomes_slower_after_long_is_late_for_seconds_and_then_begins_sooner():
+    """As where another program takes the processor; what took little an hour ago is not what the next takes."""
+    start, recording = (random_scene(1, frames, people, torch.Generator()) for frames, people in ((8, 2), (2000, 1)))
+    line, member = Line([]), Slower(recording, start, "AB", "B")
+    member.line = line
+    process = Process(member, line, Gate("AB", "B", "", 0), {"A"}, meet=0.0, clock=lambda: line.now, session=1)
+    assert process.run(400)["late"] <= 1
+    at_first = process.report.late
+    while process.report.tokens < 440:
+        process.turn()
+    became = process.report.late
+    while process.report.tokens < 480:
+        process.turn()
+    assert became > at_first and process.report.late == became
+
+
 def test_where_the_clock_runs_slower_tokens_are_due_later_and_nothing_else_changes():
     """Ten tokens at a quarter of real time take as long as forty."""
     took, reports = [], []
