@@ -12,6 +12,7 @@ from magnet.generation.settling import settled_chunk
 from magnet.motion.frames import posed
 from magnet.motion.scene import Scene, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.options import SamplerOptions, Settling
 
 
 def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Scene | None) -> Scene:
@@ -44,6 +45,19 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
         fixed = world.rows_by_frame(known[first:stop])
         made = corrected_alike(world, seen, fixed).replace(present=made.present)
     return freeze_after(made, world.rows_by_frame(placed), before)
+
+
+def settle_of_groups(said: SamplerOptions | None, filled: SamplerOptions, known: Tensor) -> Settling | None:
+    """How scenes of three and more people are corrected; None: as couples are.
+
+    Couples hold hands; three and more from nothing walk in circles, clap and part.
+
+    Args:
+        said: options before they were `filled` with those that are best for the model.
+        known: (N, P) bool, which tokens are given.
+    """
+    unsaid = said is None or said.settle is None
+    return "firm" if unsaid and filled.settle == "hold" and not bool(known.any()) else None
 
 
 def corrected_alike(world: World, scene: Scene, fixed: Tensor) -> Scene:

@@ -18,6 +18,7 @@ from magnet.denoiser.options import Sampling
 from magnet.denoiser.transformer import is_plain, without_dropout
 from magnet.generation.body_guidance import BodyGuidance
 from magnet.generation.causal_bodies import finalize_bodies, shown
+from magnet.generation.chunk_bodies import settle_of_groups
 from magnet.generation.conditioning import (
     Encoders,
     known_tokens,
@@ -42,7 +43,7 @@ from magnet.precision import dtype_of
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
-from magnet.sampling.options import SamplerOptions, Settling
+from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
@@ -212,9 +213,7 @@ class Rollout:
         self.there: float = self.length
         self.expected = Expected(receptive_field(model)[1])
         self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
-        # Couples hold hands. Three and more from nothing walk in circles, clap and part.
-        unsaid = (options is None or options.settle is None) and not bool(self.known.any())
-        groups: Settling | None = "firm" if unsaid and o.settle == "hold" else None
+        groups = settle_of_groups(options, o, self.known)
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, stats, groups)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)
