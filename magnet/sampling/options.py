@@ -96,9 +96,9 @@ class SamplerOptions:
             people calm down; a little over 1 they keep their pace (Karras et al. 2022, S_noise). None: as the model is
             best sampled, or 1.
         shift: over 1: more of the evenly spaced levels are high ones; 1: even, as in the paper.
-        crowd_enter, crowd_leave: metres over the ground within which somebody in a crowd becomes one's partner, and
-            beyond which a partner stops being one. With 2.5 and 3.5 m strangers crowd together, because the models
-            learned from couples (docs/crowds.md).
+        crowd_enter: metres over the ground within which somebody in a crowd becomes one's partner. With 2.5, and 3.5 to
+            leave, strangers crowd together, because the models learned from couples (docs/crowds.md).
+        crowd_leave: metres beyond which a partner in a crowd stops being one.
         crowd_spacing: metres between the couples with which a crowd from nothing begins, at least 1.5.
         any_floor: accept scenes in which everybody stands far from y = 0, where models have their floor.
         guidance: motion history guidance (paper A.7), off by default.

@@ -163,7 +163,11 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
     assert max(len(text.splitlines()) for text in texts) < 300
     names = [*registry.classes(), "Denoiser", "Tokenizer"]
     fields = set(re.findall(r"^ +(--[\w.]+)", "".join([*texts, *map(told, names)]), re.MULTILINE))
-    assert set(re.findall(r"^ +(--[\w.]+)", told("all"), re.MULTILINE)) <= fields
+    everything = told("all")
+    assert set(re.findall(r"^ +(--[\w.]+)", everything, re.MULTILINE)) <= fields
+    words = " ".join(everything.split())
+    silent = re.findall(r" (--(?:model|data|task|sampler)\.[\w.]+) \S+ \(type:", words)
+    assert not silent, "each field is told in words, not by its type alone"
 
 
 @pytest.mark.parametrize(
