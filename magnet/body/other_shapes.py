@@ -13,7 +13,8 @@ from magnet.body.floor import counting, lowest, off_floor
 from magnet.body.joints import ANKLES, FEET, HIPS, KNEES
 from magnet.body.reach import reach
 from magnet.body.repair import UPRIGHT
-from magnet.body.settle import Settle, corrected, correction
+from magnet.body.settle import corrected, correction
+from magnet.body.settle_options import Settle
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.runs import held
 from magnet.motion.scene import Scene

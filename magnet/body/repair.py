@@ -19,7 +19,8 @@ from magnet.body.fixed import fixed_anywhere, fixed_in, fixed_of
 from magnet.body.floor import JUMP, JUMPED, OFF, lowest, standing
 from magnet.body.indices import pairs_of
 from magnet.body.jumps import unjumped
-from magnet.body.settle import Settle, corrected, correction
+from magnet.body.settle import corrected, correction
+from magnet.body.settle_options import Settle
 from magnet.body.settle_past import Past, past_of
 from magnet.body.settle_wishes import FIRM, SLIDES, Wishes
 from magnet.motion.scene import FPS, Scene, cat_time, concatenate

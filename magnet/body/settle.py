@@ -17,9 +17,10 @@ from magnet.body.fixed import fixed_in
 from magnet.body.indices import indices
 from magnet.body.joints import ANKLES, COLLARS, ELBOWS, HIPS, KNEES, PARENTS, SHOULDERS, SPINE2
 from magnet.body.settle_goals import Goals
+from magnet.body.settle_options import Settle
 from magnet.body.settle_past import Past
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals
-from magnet.body.settle_steps import Settle, Smoothness, exact_step, solve
+from magnet.body.settle_steps import Smoothness, exact_step, solve
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec
@@ -182,7 +183,7 @@ def correct_window(
     capsules = with_measured(fit_capsules(body, scene.betas), rest)
     few = (free.sum(dim=(1, 2)) <= SOLVED_AT_ONCE).view(B, 1, 1, 1)  # no scene depends on the others
     done = torch.zeros_like(few)
-    goals = Goals.of(wishes, free, settle.stand, settle.hold, settle.pull, settle.hard, settle.swing)
+    goals = Goals.of(wishes, free, settle)
     for _ in range(settle.iterations):
         R_world, joints = body.bone_chain(*moved(scene.body_rot, scene.T_world_root, offset), rest)
         seen = Seen(R_world.flatten(0, 2), joints.flatten(0, 2), capsules.posed(R_world, joints), joints)

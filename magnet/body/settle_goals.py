@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,6 +11,7 @@ from torch.nn import functional as F
 
 from magnet.body.indices import indices, pairs_of
 from magnet.body.joints import ANKLES, FEET, TOES, WRISTS
+from magnet.body.settle_options import Settle
 from magnet.body.settle_wishes import Wishes
 
 WEIGHTS = {"between": 200.0, "within": 15.0, "hold": 10.0, "stand": 60.0, "height": 30.0, "floor": 30.0, "float": 60.0}
@@ -46,48 +46,30 @@ class Goals:
         rows: three of each pair of hands that hold, then those of feet, last the floor under the four joints of each
             free node's.
         holds: how many pairs of hands.
-        pull: metres, see `Settle`.
         float_node: (F,) nodes whose lower foot shall not be too high.
         clearance: (F, 4) height of their feet's joints over the sole, metres.
         highest: (F,) metres over the floor.
-        float_weight: square root of what it costs.
         both: (B, T, Q) bool, pairs of people who may be deep in each other.
         own: b, t, p of each free node.
         before: (B, 1, P, 22, 3) joints in the frame before; None: there is none.
-        swing: factor of what it costs that toes swing too low; 0: they may.
         fps: frames a second.
-        between: cost of a squared metre of depth between people.
+        settle: what each kind costs.
     """
 
     rows: Rows
     holds: int
-    pull: float
     float_node: Tensor
     clearance: Tensor
     highest: Tensor
-    float_weight: float
     both: Tensor
     own: tuple[Tensor, Tensor, Tensor]
     before: Tensor | None
-    swing: float
     fps: float
-    between: float
+    settle: Settle
 
     @classmethod
-    def of(
-        cls,
-        wishes: Wishes,
-        free: Tensor,
-        stand: float = 1.0,
-        hold: float = 1.0,
-        pull: float = math.inf,
-        hard: float = 1.0,
-        swing: float = 0.0,
-    ) -> Goals:
-        """The goals of people who are free (B, T, P) bool.
-
-        wishes: `Wishes.of_those` who are free; stand, hold, pull, hard, swing: see `Settle`.
-        """
+    def of(cls, wishes: Wishes, free: Tensor, settle: Settle) -> Goals:
+        """The goals of people who are free (B, T, P) bool. wishes: `Wishes.of_those` who are free"""
         T, P = free.shape[1:]
         first, second = pairs_of(P, free.device)
 
@@ -97,16 +79,16 @@ class Goals:
         b, t, pair, i, j = wishes.held.nonzero(as_tuple=True)
         reach = node(b, t, second[pair]), HAND + j
         hands = wishes.between[b, t, pair, i, j]
-        parts = [rows_of("hold", node(b, t, first[pair]), HAND + i, (0, 1, 2), hands, hold, reach)]
+        parts = [rows_of("hold", node(b, t, first[pair]), HAND + i, (0, 1, 2), hands, settle.hold, reach)]
         feet, toes = (indices(joints, free.device) for joints in (FEET, TOES))
         b, t, p, i = wishes.stands.nonzero(as_tuple=True)
-        still = wishes.between.new_zeros(len(b), 2)
-        parts.append(rows_of("stand", node(b, t + 1, p), feet[i], (0, 2), still, stand, (node(b, t, p), feet[i])))
+        still, before = wishes.between.new_zeros(len(b), 2), (node(b, t, p), feet[i])
+        parts.append(rows_of("stand", node(b, t + 1, p), feet[i], (0, 2), still, settle.stand, before))
         if wishes.stood is not None:
             b, p, i = wishes.stood.isfinite().all(dim=-1).nonzero(as_tuple=True)
-            parts.append(rows_of("stand", node(b, b * 0, p), feet[i], (0, 2), wishes.stood[b, p, i], stand))
+            parts.append(rows_of("stand", node(b, b * 0, p), feet[i], (0, 2), wishes.stood[b, p, i], settle.stand))
         keep = wishes.heights.isfinite()
-        if swing:  # toes that stand neither before nor after are to be lifted
+        if settle.swing:  # toes that stand neither before nor after are to be lifted
             standing = wishes.stands[..., len(ANKLES) :]
             keep = keep & (F.pad(standing, (0, 0, 0, 0, 1, 0)) | F.pad(standing, (0, 0, 0, 0, 0, 1)))
         b, t, p, i = keep.nonzero(as_tuple=True)
@@ -119,18 +101,15 @@ class Goals:
         return cls(
             rows=Rows(*(torch.cat(each) for each in zip(*parts, strict=True))),
             holds=len(hands),
-            pull=pull,
             float_node=node(b, t, p),
             clearance=wishes.clearance[b, p],
             highest=wishes.highest[b, t, p],
-            float_weight=(WEIGHTS["float"] * hard) ** 0.5,
             both=(wishes.present[:, first] & wishes.present[:, second])[:, None]
             & (free[..., first] | free[..., second]),
             own=own,
             before=wishes.before,
-            swing=swing,
             fps=wishes.fps,
-            between=WEIGHTS["between"] * hard,
+            settle=settle,
         )
 
 

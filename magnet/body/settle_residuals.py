@@ -83,15 +83,11 @@ def unmet(seen: Seen, goals: Goals) -> Residuals:
     point, other = points[rows.node, rows.place], points[rows.other, rows.other_place]
     value = ((point - other * rows.two[:, None]) * rows.along).sum(-1) - rows.goal
     weight = rows.root_weight
-    if goals.holds and goals.pull < torch.inf:
-        off = value[: 3 * goals.holds].view(-1, 3).norm(dim=-1).clamp_min(goals.pull)
-        weight = torch.cat(
-            [
-                weight[: 3 * goals.holds] * (goals.pull / off).sqrt().repeat_interleave(3),
-                weight[3 * goals.holds :],
-            ]
-        )
-    if goals.swing:
+    hands, pull = 3 * goals.holds, goals.settle.pull
+    if hands and pull < torch.inf:
+        off = value[:hands].view(-1, 3).norm(dim=-1).clamp_min(pull)
+        weight = torch.cat([weight[:hands] * (pull / off).sqrt().repeat_interleave(3), weight[hands:]])
+    if goals.settle.swing:
         value, weight = lifted(value, weight, seen, goals)
     own = Residuals(
         rows.node,
@@ -107,16 +103,11 @@ def unmet(seen: Seen, goals: Goals) -> Residuals:
         rows.one_sided,
     )
     over = lowest - goals.highest
-    cost, alone = torch.full_like(over, goals.float_weight), torch.zeros_like(over)
+    cost = torch.full_like(over, (WEIGHTS["float"] * goals.settle.hard) ** 0.5)
+    alone, one_sided = torch.zeros_like(over), torch.ones_like(over, dtype=torch.bool)
     node = goals.float_node
-    return cat(
-        [
-            own,
-            Residuals(
-                node, foot, sole, node, foot, sole, up, over, cost, alone, torch.ones_like(over, dtype=torch.bool)
-            ),
-        ]
-    )
+    floating = Residuals(node, foot, sole, node, foot, sole, up, over, cost, alone, one_sided)
+    return cat([own, floating])
 
 
 def lifted(value: Tensor, weight: Tensor, seen: Seen, goals: Goals) -> tuple[Tensor, Tensor]:
@@ -124,7 +115,7 @@ def lifted(value: Tensor, weight: Tensor, seen: Seen, goals: Goals) -> tuple[Ten
     lift = swung(seen.by_frame, goals.fps, goals.before)[goals.own]  # (nodes that are free, 2)
     lift = torch.cat([torch.zeros_like(lift), lift], dim=1).flatten()  # ankles, toes
     floor = len(value) - len(lift)
-    more = 1 + (goals.swing**0.5 - 1) * (lift > 0).to(lift)
+    more = 1 + (goals.settle.swing**0.5 - 1) * (lift > 0).to(lift)
     return torch.cat([value[:floor], value[floor:] + lift]), torch.cat([weight[:floor], weight[floor:] * more])
 
 
@@ -189,7 +180,7 @@ def touching(seen: Seen, capsules: FittedCapsules, goals: Goals, contact: Contac
         pelvis = pelvis.flatten(0, 2)[node[m]] - pelvis.flatten(0, 2)[others[m]]
         axis = one[kept, 1] - one[kept, 0]
         away = torch.where(cross[:, None], off_axis(pelvis * pelvis.new_tensor([1.0, 0.0, 1.0]), axis), away)
-    cost = torch.where(m < count, goals.between**0.5, WEIGHTS["within"] ** 0.5).to(depth)
+    cost = torch.where(m < count, (WEIGHTS["between"] * goals.settle.hard) ** 0.5, WEIGHTS["within"] ** 0.5).to(depth)
     always = torch.ones_like(depth)
     # The value is the depth; moving along `away` reduces it.
     return Residuals(node[m], bones[i], first, others[m], bones[j], second, -away, depth, cost, always, always.bool())

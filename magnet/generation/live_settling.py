@@ -12,7 +12,8 @@ from magnet.body import Body
 from magnet.body.apart import Apart
 from magnet.body.holding import lasting_holds
 from magnet.body.repair import settling
-from magnet.body.settle import DOFS, LEAD, Settle, corrected
+from magnet.body.settle import DOFS, LEAD, corrected
+from magnet.body.settle_options import Settle
 from magnet.body.settle_past import Past, past_of
 from magnet.generation.separation import open_body_on
 from magnet.generation.settling import Corrected, carried_on, left_deep, since_held

@@ -15,7 +15,8 @@ from magnet.body.fixed import fixed_of
 from magnet.body.holding import holds
 from magnet.body.indices import pairs_of
 from magnet.body.repair import STUBBORN, repaired, settling
-from magnet.body.settle import DOFS, Settle, corrected
+from magnet.body.settle import DOFS, corrected
+from magnet.body.settle_options import Settle
 from magnet.body.settle_past import Past, past_of
 from magnet.generation.separation import Decode, MadeRows, open_body_on
 from magnet.motion.scene import Scene

@@ -16,7 +16,8 @@ from magnet.body.energy import hand_points
 from magnet.body.fit import clearance
 from magnet.body.joints import FEET, SPINE3, TOES
 from magnet.body.repair import grounded, pressed, repaired
-from magnet.body.settle import DOFS, Settle, corrected, correction, jacobian
+from magnet.body.settle import DOFS, corrected, correction, jacobian
+from magnet.body.settle_options import Settle
 from magnet.body.settle_residuals import Seen
 from magnet.body.settle_wishes import Wishes
 from magnet.metrics import hand_distance

@@ -12,6 +12,7 @@ from magnet.body.energy import CONTACT, allowed_between_measured, allowed_within
 from magnet.body.fitted_capsules import fit_capsules, with_measured
 from magnet.body.holding import between_hands
 from magnet.body.settle_goals import Goals
+from magnet.body.settle_options import Settle
 from magnet.body.settle_residuals import Residuals, Seen, all_residuals, limits, unmet
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.scene import Scene
@@ -40,7 +41,8 @@ def asked(scene: Scene, free: Tensor, whose: bool = True) -> Residuals:
     """The residuals of people who are free; not `whose`: with everybody's wishes."""
     wishes = Wishes.of(scene, BODY, "hold")
     capsules = with_measured(fit_capsules(BODY, scene.betas), BODY.rest_joints(scene.betas[:, None]))
-    goals = Goals.of(wishes.of_those(free), free) if whose else Goals.of(wishes, torch.ones_like(free))
+    shall, who = (wishes.of_those(free), free) if whose else (wishes, torch.ones_like(free))
+    goals = Goals.of(shall, who, Settle())
     return all_residuals(seen(scene), capsules, goals, wishes.contact)
 
 
@@ -64,7 +66,7 @@ def pulls_of(scene: Scene, wishes: Wishes, held: Tensor, off: float) -> tuple[fl
     pulls = []
     everybody = torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool)
     for pull in (torch.inf, 0.1):
-        goals = Goals.of(shall, everybody, pull=pull)
+        goals = Goals.of(shall, everybody, Settle(pull=pull))
         residuals = unmet(seen(scene), goals).kept(slice(3 * goals.holds))
         force = (residuals.value * residuals.root_weight.square()).view(-1, 3)
         pulls.append(force.norm(dim=-1))

@@ -14,8 +14,9 @@ from magnet.bench.speed import standing
 from magnet.body import load_body
 from magnet.body.repair import settling
 from magnet.body.settle import DOFS, SOLVED_AT_ONCE
+from magnet.body.settle_options import Settle
 from magnet.body.settle_residuals import Residuals
-from magnet.body.settle_steps import TOGETHER, Settle, Smoothness, alike, exact_step, solve, stiffness
+from magnet.body.settle_steps import TOGETHER, Smoothness, alike, exact_step, solve, stiffness
 from magnet.generation.live_settling import SHOWN
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from magnet.body.joints import TOES
-from magnet.body.settle import Settle, corrected, correction
+from magnet.body.settle import corrected, correction
+from magnet.body.settle_options import Settle
 from magnet.body.settle_residuals import DRAGS, SWUNG, swung
 from magnet.body.settle_wishes import Wishes
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
