@@ -75,7 +75,7 @@ def off_floor(lowest: Tensor, counts: Tensor, frames: Tensor | None = None) -> T
 
 
 def counting(scene: Scene) -> Tensor:
-    """Frames of whom tell of the floor: of people who are there, if not masked. -> (B, T, P) bool"""
+    """Frames that tell where the floor is: not masked, and of people who are there. -> (B, T, P) bool"""
     counts = scene.present[:, None].expand(scene.T_world_root.shape[:3])
     return counts if scene.valid is None else counts & scene.valid[..., None]
 

@@ -180,7 +180,7 @@ def pressed(
 
 
 def grounded(scene: Scene, body: Body, fixed: Tensor | None = None) -> Scene:
-    """The scene with who is never near the floor, over or under it, moved to it as a whole.
+    """The scene with people who are never near the floor, over or under it, moved to it as a whole.
 
     Small steps of a correction would not come so far. Who is fixed in some frame, or near the floor in one, stays
     bit-identical.

@@ -120,7 +120,7 @@ def lifted(value: Tensor, weight: Tensor, seen: Seen, goals: Goals) -> tuple[Ten
 
 
 def swung(joints: Tensor, fps: float, before: Tensor | None = None) -> Tensor:
-    """How far over where they stand toes are lifted that go so fast. -> (B, T, P, 2) metres
+    """How far toes must be lifted over where they stand, by how fast they go. -> (B, T, P, 2) metres
 
     Of the toes of CMU's dancers a fifth are lower at each speed, that of the slower of two steps.
 
@@ -138,7 +138,7 @@ def swung(joints: Tensor, fps: float, before: Tensor | None = None) -> Tensor:
 
 @functools.cache
 def limits(contact: Contact, device: torch.device) -> Tensor:
-    """Depths that are allowed, infinite: never looked at; between people, then within a body. -> (2, K, K) metres
+    """Depths allowed between two people, then within one body; infinite: not compared. -> (2, K, K) metres
 
     Kept, because every step of every correction asks for them.
     """

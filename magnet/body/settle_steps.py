@@ -204,7 +204,7 @@ def exact_step(residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoo
 
 
 class Group(NamedTuple):
-    """Residuals of a few scenes that have about as many: their numbers, and where each is beside its scene's others."""
+    """Residuals of a few scenes with about as many each: their numbers, and the place of each within its scene."""
 
     rows: Tensor | slice  # (R,) int
     scene: Tensor | None  # (R,) int, of S scenes; None: there is one

@@ -35,7 +35,7 @@ class EmptySplitError(ValueError):
 
 
 def clips_of(data: MotionDataModule, split: Split) -> list[Clip]:
-    """What a data set's `clips` gives, of a stranger's as of ours.
+    """The clips of a split, checked, because a data set may be somebody else's.
 
     Raises:
         DataError: it is not there, takes no split, raises what is no ValueError, or gives something else than clips.

@@ -18,7 +18,7 @@ OFTEN = 0.5
 
 
 def doubt_of(clips: Sequence[Clip]) -> str | None:
-    """What is doubtful of the clips of one data set, of the first one of which it is; None: nothing is."""
+    """Why the clips of a data set look wrong, told of the first one that does; None: they look right."""
     count = min(len(clips), LOOKED_AT)
     some = [clips[k * len(clips) // count] for k in range(count)]
     heights = []
@@ -39,7 +39,7 @@ def doubt_of(clips: Sequence[Clip]) -> str | None:
 
 
 def _looked_at(clip: Clip) -> tuple[str | None, float]:
-    """What is wrong with unit or axis, in words, and how far off the floor everybody stands, in metres, 0 if nobody."""
+    """What is wrong with unit or axis, None: nothing; and metres that everybody stands over the floor, else 0."""
     scene = clip.scene.to("cpu").to_float32()
     counts = counting(scene)
     frames = counts.any(dim=2)[0].nonzero()[:, 0]

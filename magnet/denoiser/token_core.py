@@ -246,7 +246,7 @@ def tokenizer_of(options: dict[str, Any]) -> TokenizerCore:
 
 
 def taken_by(kind: type) -> set[str]:
-    """Names of what a class is made with, and of what it hands on to those that it is made of (`**kwargs`)."""
+    """Parameters of a class's `__init__`, and of its bases' as far as it hands on `**kwargs`."""
     names: set[str] = set()
     for each in kind.__mro__:
         if "__init__" in vars(each):

@@ -143,7 +143,7 @@ def others_expected(
     others: Tensor,
     shown: Scene,
 ) -> Scene:
-    """Frames as somebody expects others to go on in them from where they are. -> (B, 4 after, P)
+    """How somebody expects others to go on from where they are. -> (B, 4 after, P)
 
     Args:
         world: in which the tokens up to `start` are placed.

@@ -339,7 +339,7 @@ class CrowdRollout(Rollout):
         return shown.transpose(1, 2).flatten(0, 1), each.transpose(1, 2).flatten(0, 1)
 
     def _work_out(self, about: Tensor, noisy: Tensor, levels: Tensor) -> None:
-        """Fill in how two people of a view stand whose tokens do not say it. about (R, W, V, M, K, 36)
+        """Fill in pairwise transforms of two people of a view who are no partners. about (R, W, V, M, K, 36)
 
         The view's ego holds pairwise transforms to both: from their expected values, with the noise of one of them.
         Two who are known stand where they are placed, whatever an ego who is not known expects.

@@ -96,7 +96,7 @@ def crowd_from_nothing(people: int, generator: torch.Generator | None = None) ->
 def start_from_nothing(
     model: DenoiserCore, scene: Scene, options: SamplerOptions | None, generator: torch.Generator | None
 ) -> Scene:
-    """How a crowd begins of which nothing is known: couples of those who are there, in their slots and of their shapes.
+    """The start of a crowd that has no motion yet: couples that the model makes, in the slots and shapes of its people.
 
     scene (1, T, P) -> (1, START, P)
     """

@@ -84,6 +84,6 @@ def own_view(clean: Tensor, stage: Stage, scenes: int = 1) -> Tensor:
 
 
 def of_itself(each: Tensor) -> Tensor:
-    """Of what everybody predicts of everybody, what each does of itself. (B, P, W, P, D) -> (B, W, P, D)"""
+    """Each agent's prediction of itself, from everybody's of everybody. (B, P, W, P, D) -> (B, W, P, D)"""
     agent = torch.arange(each.shape[1], device=each.device)
     return each[:, agent, :, agent].permute(1, 2, 0, 3)

@@ -134,7 +134,7 @@ def settled_on(
 
 
 def first_guess(past: Corrected | None, there: Tensor, frames: int) -> Tensor | None:
-    """How so many frames were to be corrected when they were expected, the last of them held. -> (B, T, p, DOFS)
+    """Corrections that so many frames were given while they were expected, the last one held. -> (B, T, p, DOFS)
 
     there (p,) int, slots; None: nothing was expected.
     """

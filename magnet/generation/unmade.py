@@ -1,4 +1,4 @@
-"""Recorded frames that a task neither reads nor makes, and such as it reads and should not."""
+"""Recorded frames beside a sample: those that a task neither reads nor makes, and those read that are not valid."""
 
 from __future__ import annotations
 

@@ -173,7 +173,7 @@ def held_points(points: Array) -> tuple[Bools, Bools]:
 
 
 def jumps(quat: Array | None, joints: Array | None, valid: Bools, but: Sequence[Flag] = ()) -> list[Flag]:
-    """Joints that turn or move from one frame to the next as none does.
+    """Flags joints that turn or move further from one frame to the next than any joint can.
 
     Args:
         quat: (T, P, 22, 4) unit quaternions, the pelvis's in the world; None: not looked at.

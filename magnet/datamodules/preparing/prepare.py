@@ -159,7 +159,7 @@ def select_takes(reader: Reader, splits: dict[str, Split] | None, limit: int | N
 
 
 def summary_of(reader: Reader) -> list[str]:
-    """What a reader says of what it found; where a stranger's fails at that, that it did: no take depends on it."""
+    """A reader's summary of what it found, or in its place the error that making it raised: no take depends on it."""
     try:
         with named_errors(type(reader), "its summary cannot be made"):
             lines: object = reader.summary()  # a stranger's may give anything
