@@ -29,6 +29,7 @@ from magnet.datamodules.preparing.canonicalize import CANONICALIZE_VERSION, Cano
 from magnet.datamodules.preparing.check_people import check_shapes
 from magnet.datamodules.preparing.genders import load_bodies, one_body
 from magnet.datamodules.preparing.progress import Tell
+from magnet.datamodules.preparing.worker_processes import ended_at_once, unheard_ctrl_c
 from magnet.datamodules.reading.recording import DataError, Gender, Reader, Take
 from magnet.datamodules.store.reader import FORMAT, body_hash
 from magnet.datamodules.store.rows import ROW, encode
@@ -381,13 +382,13 @@ def _converted(
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(workers, len(takes)), mp_context=spawn, initializer=begin, initargs=(job, kind))
     try:
-        running = {pool.submit(work, take, file(take)): take for take in takes}
-        for future in as_completed(running):  # looks at each once; `wait` looks at all that run, each time
-            yield running.pop(future), future.result()
+        with ended_at_once(pool):
+            with unheard_ctrl_c():
+                running = {pool.submit(work, take, file(take)): take for take in takes}
+            for future in as_completed(running):  # looks at each once; `wait` looks at all that run, each time
+                yield running.pop(future), future.result()
     except BrokenProcessPool as error:
         raise OSError(
             "a worker process died, perhaps for want of memory: run the same command again with fewer --workers; "
             "finished takes are kept"
         ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)

@@ -117,7 +117,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(couples, undisturbed, tmp
     finally:
         process.kill()
         process.join()
-    assert bool(started) == (workers == 2)
+    assert started or workers == 1 or during == "packing"
     until(lambda: not any(child.exists() for child in started))  # workers do not outlive who started them
     assert not (out / "manifest.json").exists()  # nothing that reads as a store
     left = {path.name.split("-")[0] for path in out.iterdir()}
