@@ -148,6 +148,18 @@ class PlainParser(argparse.ArgumentParser):
         sys.exit(2)
 
 
+OTHER_NAMES = {
+    "seconds": "frames",
+    "duration": "frames",
+    "length": "frames",
+    "output": "out",
+    "checkpoint": "ckpt_path",
+    "weights": "ckpt_path",
+    "agents": "people",
+}
+"""What other programs call some of our options."""
+
+
 def closest(name: str, known: Sequence[str]) -> str:
     """A hint at what may be meant: the same field somewhere else (--lr for --model.lr), or a similar name."""
     if (told := of_preset(name, known)) is not None:
@@ -157,7 +169,7 @@ def closest(name: str, known: Sequence[str]) -> str:
     fields = [flag for flag in flags if flag.startswith(f"{group}.")] if group else flags  # --model.foo: of the model
     by_leaf = {flag.lstrip("-").rsplit(".", 1)[-1]: flag for flag in reversed(fields)}
     leaf = leaf.lstrip("-")
-    near = [by_leaf[leaf]] if leaf in by_leaf else []
+    near = [by_leaf[each] for each in (leaf, OTHER_NAMES.get(leaf, leaf)) if each in by_leaf][:1]
     near = near or [flag for each, flag in by_leaf.items() if leaf in words(each)][:-5:-1]
     near = near or [by_leaf[match] for match in difflib.get_close_matches(leaf, by_leaf, n=1)]
     near = near or difflib.get_close_matches(name, [] if fields else flags, n=1)

@@ -183,8 +183,12 @@ class Film:
         if self.context_end:
             words.text((left, y - 16 * unit), "context" if known else "generated", fill=now, font=face, anchor="ls")
         seconds = (frame - self.context_end + 1 if self.context_end else frame) / self.scene_fps
-        stamp = f"{seconds:+.1f} s" if self.context_end else f"{seconds:.1f} s"
-        words.text((right, y - 16 * unit), stamp, fill=PALE, font=face, anchor="rs")
+        words.text((right, y - 16 * unit), stamp(seconds, bool(self.context_end)), fill=PALE, font=face, anchor="rs")
+
+
+def stamp(seconds: float, signed: bool) -> str:
+    """As "-0.5 s", "+0.0 s", or without a sign."""
+    return f"{round(seconds, 1) + 0.0:{'+' if signed else ''}.1f} s"  # -0.0 + 0.0 is 0.0
 
 
 def paint(people: Cast, view: View, frame: int, ghost: Array | None = None, trail: int = 0) -> Image.Image:

@@ -86,6 +86,8 @@ def test_options_of_several_values_may_be_repeated(parser: Callable[[], Argument
         ("demo --mintes 3", "--minute"),
         ("export a.npz b.glb --scnes 0", "--scene"),
         ("refine a.npz b.npz --tirm", "--trim"),
+        ("predict a.npz --seconds 10 --out b.glb", "--frames"),
+        ("test --checkpoint last", "--ckpt_path"),
     ],
 )
 def test_a_flag_that_is_not_there_is_answered_with_what_may_be_meant(

@@ -25,7 +25,7 @@ from magnet.export.drawing import (
     require_size,
     strokes,
 )
-from magnet.export.video import Film
+from magnet.export.video import Film, stamp
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from tests.cases import some_slow
@@ -50,6 +50,17 @@ def frames_of(path: Path) -> list[Image.Image]:
             file.seek(index)
             images.append(file.convert("RGB"))
         return images
+
+
+def test_the_clock_of_a_film_has_no_minus_nothing() -> None:
+    assert [stamp(seconds, True) for seconds in (-1.26, -0.033, 0.0, 0.04, 2.0)] == [
+        "-1.3 s",
+        "+0.0 s",
+        "+0.0 s",
+        "+0.0 s",
+        "+2.0 s",
+    ]
+    assert stamp(2.0, False) == "2.0 s"
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
