@@ -156,7 +156,9 @@ class Film:
         last = max(self.casts[0].frames - 1, 1)
         at = left + (right - left) * frame / last
         border = left + (right - left) * min(self.context_end / last, 1.0)
-        known = frame < self.context_end
+        what = "context" if frame < self.context_end else "generated"
+        if all(each.known[frame].all() for each in self.casts) and what == "generated":
+            what = "keyframe"
         scale = 2  # the bar alone is drawn larger and shrunk, for smooth ends
         upper = int(y - 8 * unit)
         strip = page.crop((0, upper, page.width, upper + max(int(16 * unit), 1)))
@@ -174,14 +176,14 @@ class Film:
         bar(left, at, GENERATED)
         bar(left, min(at, border), PINK)
         knob = 6 * unit * scale
-        now = PINK if known else GENERATED
+        now = GENERATED if what == "generated" else PINK
         box = (at * scale - knob, middle - knob, at * scale + knob, middle + knob)
         draw.ellipse(box, fill=now, outline=PAGE, width=scale)
         page.paste(strip.reduce(scale), (0, upper))
         words = ImageDraw.Draw(page)
         face = font(15 * unit)
         if self.context_end:
-            words.text((left, y - 16 * unit), "context" if known else "generated", fill=now, font=face, anchor="ls")
+            words.text((left, y - 16 * unit), what, fill=now, font=face, anchor="ls")
         seconds = (frame - self.context_end + 1 if self.context_end else frame) / self.scene_fps
         words.text((right, y - 16 * unit), stamp(seconds, bool(self.context_end)), fill=PALE, font=face, anchor="rs")
 

@@ -115,6 +115,14 @@ def test_known_frames_are_pink_and_generated_ones_are_not(
         assert pixels_like(known, colour) == 0
 
 
+def test_the_time_bar_tells_keyframes_which_are_given_too(duet: Scene, body: Body, pixels_like: Count) -> None:
+    given = torch.zeros(1, 12, 2, dtype=torch.bool)
+    given[:, :4], given[:, 8], given[:, 10, 0] = True, True, True
+    movie = film(duet.replace(given=given), body)
+    pink = [pixels_like(movie.draw(frame).crop((0, 95, 160, 120)), CONTEXT[0]) for frame in (7, 8, 10)]
+    assert pink[1] > pink[0] + 10 and pink[2] == pink[0], "only where everybody is given"
+
+
 def test_a_mask_can_give_one_person_only(duet: Scene, body: Body, pixels_like: Count) -> None:
     given = torch.tensor([[False, True]]).expand(1, 12, 2)
     image = film(duet.replace(given=given), body).draw(11)
