@@ -148,7 +148,7 @@ COMMANDS = sorted(
         line.partition("   #")[0].removesuffix("...").strip()
         for page in PAGES
         for line in re.findall(
-            r"^ {4}magnet ((?:fit|validate|test|predict) .*--data .*)",
+            r"^ {4}magnet ((?:fit|validate|test|predict) .*--data (?!mydata\.).*)",  # a reader's own file
             page.read_text().replace("\\\n", " "),  # lines that a backslash continues
             re.MULTILINE,
         )
