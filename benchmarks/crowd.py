@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -88,8 +88,8 @@ def rolled(
 ) -> Iterator[Scene]:
     """A crowd that goes on from a start, chunk by chunk."""
     generator = torch.Generator().manual_seed(1)
-    more: dict[str, Any] = {"options": model.sampler, "generator": generator, "progress": progress, "stats": stats}
-    return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, **more).chunks()
+    how = model.sampler, generator, progress, stats
+    return CrowdRollout(model.denoiser, start, JointFuture(), START, frames, *how).chunks()
 
 
 def couples(model: magnet.Model, people: int) -> list[Scene]:

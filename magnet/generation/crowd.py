@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settl
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
 from magnet.generation.inputs import check_condition
 from magnet.generation.loaded import Loaded, denoiser_of
-from magnet.generation.rollout import Rollout
+from magnet.generation.rollout import CHUNK, Generators, Rollout
 from magnet.generation.separation import Decode
 from magnet.generation.stats import SamplingStats
 from magnet.motion.frames import from_9d, inverse, project_se2, to_9d, to_planar
@@ -77,19 +76,18 @@ def generate_crowd(
     require_whole("samples", samples, 1)
     check_condition(cond, scene.scenes, 0)  # of all scenes; each rollout gets that of its own, with the weight
     model, made = denoiser_of(model), []
+    how = options, generator, progress, stats
     for number in range(scene.scenes * samples):
         which = [number // samples]
-        more: dict[str, Any] = {"options": options, "generator": generator, "progress": progress, "stats": stats}
-        more["cond"] = None if cond is None else cond[which]
-        one = scene.select(which)
+        one, said = scene.select(which), None if cond is None else cond[which]
         if scene.agents > model.layout.agents and context == 0 and isinstance(task, Generation):
             require_crowd(model, one, TOKEN_FRAMES, options or SamplerOptions())
             start, rest = start_from_nothing(model, one, options, generator), max(frames - START, TOKEN_FRAMES)
-            whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, **more).chunks()))
+            whole = cat_time(list(CrowdRollout(model, start, JointFuture(), START, rest, *how, cond=said).chunks()))
             nobody = torch.zeros(whole.T_world_root.shape[:3], dtype=torch.bool, device=whole.T_world_root.device)
             whole = whole.replace(given=nobody).slice(0, frames)
         else:
-            rollout = CrowdRollout(model, one, task, context, frames, **more)
+            rollout = CrowdRollout(model, one, task, context, frames, *how, cond=said)
             whole = cat_time(list(rollout.chunks()))
             if rollout.world.causal:  # whoever lives now does not make way for what is to come
                 made.append(whole)
@@ -113,8 +111,12 @@ class CrowdRollout(Rollout):
         context: int,
         frames: int | None,
         options: SamplerOptions | None = None,
-        generator: torch.Generator | None = None,
-        **more: Any,
+        generator: Generators = None,
+        progress: Callable[[int], None] | None = None,
+        stats: SamplingStats | None = None,
+        *,
+        chunk: int | None = CHUNK,
+        cond: Tensor | None = None,
     ) -> None:
         self.crowd = scene.agents > model.layout.agents
         if self.crowd:
@@ -131,7 +133,8 @@ class CrowdRollout(Rollout):
         self._guess, self._guess_at = torch.empty(0), 0  # what was predicted last, and the token step it begins with
         people = scene.pad_agents(max(scene.agents, model.layout.agents))
         self._look_around(people, context)
-        super().__init__(self.model, scene, task, context, frames, 1, options, generator, **more)
+        how = options, generator, progress, stats
+        super().__init__(self.model, scene, task, context, frames, 1, *how, chunk=chunk, cond=cond)
         if self.crowd:
             self.world.decode_rows = self._decode_rows
             self.world.steer = None if self.world.causal else self._steer  # nobody gives way to what is not seen yet

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,6 +43,7 @@ from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
 from magnet.sampling.options import SamplerOptions
+from magnet.sampling.planned_stage import Denoising
 from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
@@ -97,8 +97,10 @@ def generate(
         ValueError: context is not a whole number of tokens, the scene's slots do not fit the model, or in some
             scene nobody is there to be generated, or nobody to be given where the task gives somebody.
     """
-    more: dict[str, Any] = {"progress": progress, "stats": stats, "cond": cond, "slots": slots}
-    rollout = Rollout(denoiser_of(model), scene, task, context, frames, samples, options, generator, **more)
+    model = denoiser_of(model)
+    rollout = Rollout(
+        model, scene, task, context, frames, samples, options, generator, progress, stats, cond=cond, slots=slots
+    )
     return cat_time(list(rollout.chunks()))
 
 
@@ -137,10 +139,12 @@ def stream(
         chunk = None if options.settle == "off" else CHUNK
     if chunk is not None:
         require_whole("chunk", chunk, 1)
-    more: dict[str, Any] = {"progress": progress, "stats": stats, "cond": cond, "chunk": chunk}
     model = denoiser_of(model)
     require_rate(scene)
-    rollout = Rollout(model, scene.clone(), task, context, frames, samples, options, generator, **more)
+    scene = scene.clone()
+    rollout = Rollout(
+        model, scene, task, context, frames, samples, options, generator, progress, stats, chunk=chunk, cond=cond
+    )
     return (made.clone() for made in rollout.chunks())
 
 
@@ -163,9 +167,9 @@ class Rollout:
         samples: int = 1,
         options: SamplerOptions | None = None,
         generator: Generators = None,
-        *,
         progress: Callable[[int], None] | None = None,
         stats: SamplingStats | None = None,
+        *,
         chunk: int | None = CHUNK,
         cond: Tensor | None = None,
         slots: int = 0,
@@ -277,22 +281,10 @@ class Rollout:
             self._bring_in(stage.stop + 1)  # the delta into the token after the window is written too
             held = dataclasses.replace(stage, start=stage.start - self.first)
             world.faint = faint_levels(self.options.guidance, world.known, held, world.since, world.causal)
-            self.tokens = run_stages(
-                self._guided_by_condition,
-                [held],
-                self.tokens,
-                self.mask_noise,
-                world.given.present,
-                self.model.layout,
-                world.make_consistent,
-                self.progress,
-                self.options.guidance,
-                self.noise,
-                self.first,
-                self.history,
-                self.body_guidance,
-                lambda _: world.faint,
-            )
+            what, who, guidance = self._guided_by_condition, world.given.present, self.options.guidance
+            how = Denoising(what, who, self.model.layout, guidance, self.noise, self.body_guidance, self.progress)
+            rows, faint = (self.tokens, self.mask_noise), lambda _: world.faint
+            self.tokens = run_stages(how, [held], *rows, world.make_consistent, self.first, self.history, faint)
         self.reached = max(self.reached, stage.active[1])
         if world.causal and self.expected.most:
             self.expected.keep(stage, *views(self._clean, stage, len(self.tokens)))

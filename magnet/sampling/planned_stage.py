@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Protocol
 
@@ -30,6 +30,29 @@ class Correct(Protocol):
     """
 
     def __call__(self, clean: Tensor, now: Tensor, hidden: Tensor | None, first: int) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """What all stages of a sample share.
+
+    Attributes:
+        denoise: the model.
+        present: (B, P) bool.
+        layout: which numbers of a token share a level.
+        guidance: what the prediction is pushed toward.
+        noise: gives the step noise; None: there is none.
+        correct: changes what each step predicts.
+        progress: told 1 after each denoising step.
+    """
+
+    denoise: DenoiseFn
+    present: Tensor
+    layout: TokenLayout
+    guidance: Guidance = field(default_factory=Guidance)
+    noise: NoiseStream | None = None
+    correct: Correct | None = None
+    progress: Callable[[int], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -71,27 +94,22 @@ class StagePlan:
 
 @torch.inference_mode()
 def run_planned_stage(
-    denoise: DenoiseFn,
+    how: Denoising,
     stage: Stage,
     tokens: Tensor,
     mask_noise: Tensor,
-    present: Tensor,
-    layout: TokenLayout,
-    progress: Callable[[int], None] | None,
-    guidance: Guidance,
-    noise: NoiseStream | None = None,
     first: int = 0,
     history: History | None = None,
-    correct: Correct | None = None,
     faint: Tensor | None = None,
 ) -> Tensor:
     """The denoising steps of one window position. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)
 
-    `first` is the row of `noise` that the window begins with; `history` is that of the window; `faint` (W, P) int
+    `first` is the row of `how.noise` that the window begins with; `history` is that of the window; `faint` (W, P) int
     are the levels at which finished tokens are shown. Agents that see the same share a view, and all views run as one
     batch.
     """
     B, W, P, _ = tokens.shape
+    present, layout, noise = how.present, how.layout, how.noise
     eta = noise.eta if noise is not None else 0.0
     plan = plan_of(stage, layout, eta, history, tokens.device)
     groups, rows, V = layout.groups(tokens.device), plan.rows, plan.levels.shape[1]
@@ -113,10 +131,10 @@ def run_planned_stage(
         if views is not None:
             shown = torch.where(unknown, mask_noise[:, None], tokens[:, None]).flatten(0, 1)
         each = levels.expand(B, V, W, P).flatten(0, 1)
-        pushed, clean = guidance.apply(denoise, shown, each, present, shown_noise, layout, faint)
-        if guidance.smooth:
+        pushed, clean = how.guidance.apply(how.denoise, shown, each, present, shown_noise, layout, faint)
+        if how.guidance.smooth:
             part = torch.where(stays, part, read(pushed))
-        clean = read(clean if correct is None else correct(clean, levels, hidden, first))
+        clean = read(clean if how.correct is None else how.correct(clean, levels, hidden, first))
         carry, signal, left, old, new, signal_after = numbers
         ahead = clean
         if history is not None:
@@ -128,8 +146,8 @@ def run_planned_stage(
         moved = torch.where(ends, ahead, signal_after * ahead + rest)
         part = torch.where(stays, part, moved)
         tokens[:, rows] = part
-        if progress is not None:
-            progress(1)
+        if how.progress is not None:
+            how.progress(1)
     if history is not None:
         history.levels[rows] = plan.last[..., layout.groups()]
     return tokens

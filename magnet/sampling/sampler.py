@@ -12,7 +12,7 @@ from magnet.motion.tokens import TokenLayout
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import NoiseStream
-from magnet.sampling.planned_stage import Correct, run_planned_stage
+from magnet.sampling.planned_stage import Denoising, run_planned_stage
 from magnet.sampling.schedule import MaskSchedule, Stage, initial_levels
 from magnet.sampling.solvers import History, Solver
 
@@ -61,24 +61,14 @@ def sample(
     B, N, P, D = tokens.shape
     if (schedule.tokens, schedule.agents) != (N, P):
         raise ValueError(f"tokens are {N} x {P} (time x agents), the schedule {schedule.tokens} x {schedule.agents}")
+    guidance = guidance or Guidance()
     noise = noise or NoiseStream((B, P, D), generator, tokens.device, tokens.dtype)
     init_noise, mask_noise = noise.draw(N)
     tokens = begin(tokens, init_noise, schedule.known, layout)
     history = None if solver == "ddim" else History.empty(tokens)
-    return run_stages(
-        denoise,
-        schedule.stages,
-        tokens,
-        mask_noise,
-        present,
-        layout,
-        on_stage_end,
-        progress,
-        guidance,
-        noise,
-        history=history,
-        faint=functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal) if guidance else None,
-    )
+    how = Denoising(denoise, present, layout, guidance, noise, progress=progress)
+    faint = functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal)
+    return run_stages(how, schedule.stages, tokens, mask_noise, on_stage_end, history=history, faint=faint)
 
 
 def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> Tensor:
@@ -89,48 +79,30 @@ def begin(tokens: Tensor, noise: Tensor, known: Tensor, layout: TokenLayout) -> 
 
 @torch.no_grad()
 def run_stages(
-    denoise: DenoiseFn,
+    how: Denoising,
     stages: Iterable[Stage],
     tokens: Tensor,
     mask_noise: Tensor,
-    present: Tensor,
-    layout: TokenLayout,
     on_stage_end: StageCallback | None = None,
-    progress: Callable[[int], None] | None = None,
-    guidance: Guidance | None = None,
-    noise: NoiseStream | None = None,
     offset: int = 0,
     history: History | None = None,
-    correct: Correct | None = None,
     faint: Faint | None = None,
 ) -> Tensor:
     """Run stages in their order. tokens, mask_noise (B, N, P, D) -> (B, N, P, D)
 
-    Arguments as for `sample`. `noise` gives the step noise; `offset` is the token step, of all its token steps, that
-    `tokens` begin with. With a `history` of the tokens the solver is a multistep one, which updates it;
-    `correct` changes what each step predicts; `faint` says how noisy finished tokens are shown, `None`: clean.
+    Arguments as for `sample`. `offset` is the token step, of all those of `how.noise`, that `tokens` begin with. With a
+    `history` of the tokens the solver is a multistep one, which updates it; `faint` says how noisy finished tokens are
+    shown, `None`: clean.
     """
-    tokens, guidance = tokens.clone(), guidance or Guidance()
+    tokens = tokens.clone()
     for stage in stages:
         window = slice(stage.start, stage.stop)
         levels = None if faint is None else faint(stage)
         if levels is not None:
             levels = levels[window].to(tokens.device) if bool(levels[window].any()) else None
-        tokens[:, window] = run_planned_stage(
-            denoise,
-            stage,
-            tokens[:, window],
-            mask_noise[:, window],
-            present,
-            layout,
-            progress,
-            guidance,
-            noise,
-            offset + stage.start,
-            None if history is None else history.window(window),
-            correct,
-            levels,
-        )
+        past = None if history is None else history.window(window)
+        held, masked = tokens[:, window], mask_noise[:, window]
+        tokens[:, window] = run_planned_stage(how, stage, held, masked, offset + stage.start, past, levels)
         if on_stage_end is not None:
             finished = torch.zeros(tokens.shape[1:3], dtype=torch.bool)
             finished[window] = (stage.levels[-1] == 0) & (stage.levels[0] > 0)

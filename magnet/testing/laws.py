@@ -14,6 +14,7 @@ from magnet.motion.tokens import TokenLayout
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.planned_stage import Denoising
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.sampling.solvers import History
@@ -182,19 +183,19 @@ def _check_samples(task: Task, grid: Grid, schedule: MaskSchedule) -> None:
 
 def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guidance | None = None) -> None:
     """Check hiding: change what a stage hides from an agent, in the tokens and in all that the model predicts of it."""
-    layout = TokenLayout(latent=4, agents=grid.agents)
+    guidance, layout = guidance or Guidance(), TokenLayout(latent=4, agents=grid.agents)
     shape = (1, grid.tokens, grid.agents, layout.width)
     generator = torch.Generator().manual_seed(1)
     tokens, noise, mask_noise, other = (torch.randn(shape, generator=generator) for _ in range(4))
     present = torch.ones(1, grid.agents, dtype=torch.bool)
     tokens = begin(tokens, noise, schedule.known, layout)
     history = History.empty(tokens)
-    faint = functools.partial(faint_levels, guidance or Guidance(), schedule.known, live=schedule.causal)
+    faint = functools.partial(faint_levels, guidance, schedule.known, live=schedule.causal)
     last = max((n for n, stage in enumerate(schedule.stages) if stage.visibility is not None), default=-1)
     for number, stage in enumerate(schedule.stages[: last + 1]):
         before, past = tokens, history.copy()
-        same = mask_noise, present, layout
-        tokens = run_stages(mixing, [stage], before, *same, guidance=guidance, history=history, faint=faint)
+        how = Denoising(mixing, present, layout, guidance)
+        tokens = run_stages(how, [stage], before, mask_noise, history=history, faint=faint)
         if stage.visibility is None:
             continue
         window = slice(stage.start, stage.stop)
@@ -211,8 +212,8 @@ def check_hidden(task: Task, grid: Grid, schedule: MaskSchedule, guidance: Guida
                 return torch.where(secret, 1 - 3 * said, said)
 
             # Smoothing follows what is said of everybody, in each agent's own view: not told by what is hidden.
-            model = mixing if guidance is not None and guidance.smooth else lying
-            after = run_stages(model, [stage], changed, *same, guidance=guidance, history=remembered, faint=faint)
+            how = dataclasses.replace(how, denoise=mixing if guidance.smooth else lying)
+            after = run_stages(how, [stage], changed, mask_noise, history=remembered, faint=faint)
             alike = ((after == tokens)[:, window] | secret).all(dim=-1).flatten(0, 1).all(dim=0)
             for agent in (every == hidden).flatten(1).all(dim=1).nonzero()[:, 0].tolist():
                 message = f"stage {number}: what it hides from agent {agent} influences that agent's tokens"
@@ -269,7 +270,8 @@ def sampled_blind(schedule: MaskSchedule, layout: TokenLayout, people: int, draw
         return layout.pack(latent, deltas, torch.tanh(pairs + deltas.mean(dim=(-1, -2))[..., None, None, None]))
 
     tokens = begin(tokens, noise, schedule.known, layout)
-    return run_stages(blind, schedule.stages, tokens, mask_noise, there.expand(len(tokens), P), layout)
+    how = Denoising(blind, there.expand(len(tokens), P), layout)
+    return run_stages(how, schedule.stages, tokens, mask_noise)
 
 
 def reordered(tokens: Tensor, order: Tensor, layout: TokenLayout) -> Tensor:

@@ -17,9 +17,8 @@ from magnet.denoiser.options import TransformerOptions
 from magnet.denoiser.transformer import Transformer
 from magnet.generation.rollout import generate
 from magnet.motion.tokens import TokenLayout
-from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
-from magnet.sampling.planned_stage import run_planned_stage
+from magnet.sampling.planned_stage import Denoising, run_planned_stage
 from magnet.sampling.schedule import Grid
 from magnet.sampling.solvers import History
 from magnet.tasks import registry
@@ -256,7 +255,7 @@ def test_inside_a_stage_nothing_waits_for_the_device(task: str, solver: str, mon
 
         kept = None if history is None else history.window(rows)
         part = tokens[:, rows]
-        run_planned_stage(ask, stage, part, part.clone(), there, layout, None, Guidance(), history=kept)
+        run_planned_stage(Denoising(ask, there, layout), stage, part, part.clone(), history=kept)
     assert runs == ["meta"] * plan.evaluations
     asked = part, torch.zeros(part.shape[:3], dtype=torch.long, device="meta"), there
     assert net(*asked).device.type == "meta"  # nor does the network as it is trained, where slots are few

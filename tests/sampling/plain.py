@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -11,25 +10,21 @@ from torch import Tensor
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import DenoiseFn, Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, ddim_step, half_log_snr
-from magnet.sampling.planned_stage import views_to_read
+from magnet.sampling.planned_stage import Denoising, views_to_read
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
 
 
 def run_stage(
-    denoise: DenoiseFn,
+    how: Denoising,
     stage: Stage,
     tokens: Tensor,
     mask_noise: Tensor,
-    present: Tensor,
-    layout: TokenLayout,
-    progress: Callable[[int], None] | None,
-    guidance: Guidance,
-    noise: NoiseStream | None = None,
     first: int = 0,
     history: History | None = None,
 ) -> Tensor:
     """As `magnet.sampling.planned_stage.run_planned_stage`. tokens, mask_noise (B, W, P, D) -> (B, W, P, D)"""
+    denoise, present, layout, guidance, noise = how.denoise, how.present, how.layout, how.guidance, how.noise
     hidden = None if stage.visibility is None else ~stage.visibility
     for now, after in pairwise(stage.levels.long()):
         group, group_after = (layout.spread(layout.group_levels(x)) for x in (now, after))
@@ -44,8 +39,8 @@ def run_stage(
                 denoise, tokens, mask_noise, now, after, hidden, present, layout, guidance
             )
         tokens = solver_step(tokens, clean, group, group_after, eta, new, history)
-        if progress is not None:
-            progress(1)
+        if how.progress is not None:
+            how.progress(1)
     return tokens
 
 

@@ -11,7 +11,7 @@ from magnet.sampling.grid import planning_grid
 from magnet.sampling.guidance import Guidance, roughness
 from magnet.sampling.noise import LEVELS, add_noise
 from magnet.sampling.options import SamplerOptions
-from magnet.sampling.planned_stage import run_planned_stage
+from magnet.sampling.planned_stage import Denoising, run_planned_stage
 from magnet.sampling.schedule import Stage
 
 PEOPLE = 3
@@ -52,7 +52,7 @@ def step(given, now: Tensor, after: Tensor, guidance: Guidance) -> Tensor:
     """One denoising step. now, after (N, P) int"""
     tokens, _, present, mask_noise = given
     stage = Stage(0, torch.stack([now, after]).short())
-    return run_planned_stage(model, stage, tokens, mask_noise, present, LAYOUT, None, guidance)
+    return run_planned_stage(Denoising(model, present, LAYOUT, guidance), stage, tokens, mask_noise)
 
 
 def test_without_guidance_nothing_changes(given):

@@ -45,11 +45,11 @@ def sampled(plan: MaskSchedule, plain: bool, guidance: Guidance, eta: float, ste
     history = History.empty(tokens) if steps_back else None
     present = torch.ones(B, P, dtype=torch.bool)
     run = run_stage if plain else planned_stage.run_planned_stage
+    how = planned_stage.Denoising(predict, present, LAYOUT, guidance, stream)
     for stage in plan.stages:
         window = slice(stage.start, stage.stop)
         kept = None if history is None else history.window(window)
-        args = (tokens[:, window], mask_noise[:, window], present, LAYOUT, None, guidance, stream, stage.start, kept)
-        tokens[:, window] = run(predict, stage, *args)
+        tokens[:, window] = run(how, stage, tokens[:, window], mask_noise[:, window], stage.start, kept)
     return tokens, history
 
 
@@ -93,9 +93,9 @@ def test_steps_wait_for_nothing_and_are_few_operators(task: str, monkeypatch: py
 
         stream = NoiseStream((B, P, LAYOUT.width), torch.Generator(), eta=1.0)
         monkeypatch.setattr(torch, "Generator", None)  # none is made
-        args = (tokens, tokens, present, LAYOUT, None, Guidance(), stream, 0, History.empty(tokens))
+        how, history = planned_stage.Denoising(denoise, present, LAYOUT, noise=stream), History.empty(tokens)
         with mode:
-            planned_stage.run_planned_stage(denoise, stage, *args)
+            planned_stage.run_planned_stage(how, stage, tokens, tokens, history=history)
         monkeypatch.undo()
         return mode
 

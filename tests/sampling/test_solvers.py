@@ -12,6 +12,7 @@ from torch import Tensor
 from magnet.motion.tokens import TokenLayout
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS, NoiseStream, alpha_bar, ddim_levels, ddim_step, half_log_snr, log_snr_levels
+from magnet.sampling.planned_stage import Denoising
 from magnet.sampling.sampler import begin, run_stages, sample
 from magnet.sampling.schedule import Grid, MaskSchedule
 from magnet.sampling.solvers import History
@@ -219,9 +220,9 @@ def test_rows_may_come_and_go_between_stages(name):
     )
     generator = torch.Generator().manual_seed(4)
     tokens, noise, mask_noise = (torch.randn(2, 14, 3, layout.width, generator=generator) for _ in range(3))
-    present = torch.ones(2, 3, dtype=torch.bool)
     start = begin(tokens, noise, schedule.known, layout)
-    whole = run_stages(mixing, schedule.stages, start, mask_noise, present, layout, history=History.empty(start))
+    how = Denoising(mixing, torch.ones(2, 3, dtype=torch.bool), layout)
+    whole = run_stages(how, schedule.stages, start, mask_noise, history=History.empty(start))
 
     held, first = start[:, :0], 0
     history, out = History.empty(held), start.clone()
@@ -231,7 +232,7 @@ def test_rows_may_come_and_go_between_stages(name):
         more = start[:, first + held.shape[1] : stage.stop]
         held, history = torch.cat([held, more], dim=1), history.extend(more)
         moved = type(stage)(stage.start - first, stage.levels, stage.visibility)
-        held = run_stages(mixing, [moved], held, mask_noise[:, first:], present, layout, history=history)
+        held = run_stages(how, [moved], held, mask_noise[:, first:], history=history)
         out[:, first : first + held.shape[1]] = held
     assert torch.equal(out, whole)
 

@@ -13,6 +13,7 @@ from magnet.motion.tokens import TokenLayout
 from magnet.sampling import sampler
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.planned_stage import Denoising
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
 from magnet.testing import TASK_GRIDS, check_hidden, renaming_law, sampled_blind, task_laws
@@ -101,8 +102,8 @@ def test_what_is_hidden_from_an_agent_is_hidden_under_guidance_too(name: str, gu
 def test_a_sampler_that_shows_what_is_hidden_breaks_the_law(name: str, monkeypatch: pytest.MonkeyPatch):
     honest = sampler.run_planned_stage
 
-    def open_to_all(denoise: Any, stage: Stage, *rest: Any) -> Tensor:
-        return honest(denoise, dataclasses.replace(stage, visibility=None), *rest)
+    def open_to_all(how: Denoising, stage: Stage, *rest: Any) -> Tensor:
+        return honest(how, dataclasses.replace(stage, visibility=None), *rest)
 
     monkeypatch.setattr(sampler, "run_planned_stage", open_to_all)
     task = registry.get(name)(**({"offset": 0.25} if name == "agentic_async" else {}))  # at 1 there is nothing to see
