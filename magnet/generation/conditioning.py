@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -148,8 +149,21 @@ def task_lookahead_limit(task: Task, grid: Grid) -> Tensor:
     return torch.minimum(lookahead_limit(schedule_of(task, grid)), lookahead_limit(schedule_of(task, wider)))
 
 
-Encoders = dict[tuple[int, ...], Carried]
-"""What is carried from token to token, by the agents who are encoded together."""
+@dataclass(frozen=True)
+class Encoders:
+    """Encoders of a scene that grows.
+
+    Attributes:
+        first: the row that the part at hand begins with.
+        carried: what is kept for the next part, by the agents who are encoded together.
+    """
+
+    first: int
+    carried: dict[tuple[int, ...], Carried]
+
+    def growing(self, agents: list[int], low: int, stop: int) -> Growing:
+        """Says how some rows of the part go on with those before."""
+        return Growing(self.carried.setdefault(tuple(agents), Carried()), self.first + low, stop - low)
 
 
 def known_tokens(
@@ -160,8 +174,7 @@ def known_tokens(
     limits: Tensor | None = None,
     packed: bool = False,
     rows: slice = slice(None),
-    carried: Encoders | None = None,
-    first_row: int = 0,
+    encoders: Encoders | None = None,
 ) -> Tensor:
     """Normalized tokens of what is known; the others hold no information. known (N, P) -> (B, rows, P, D)
 
@@ -169,8 +182,8 @@ def known_tokens(
     beyond `limits` (N, P) of `lookahead_limit`; where a limit is 0 the code is not needed. Pairwise transforms are
     those of `related`, by default the same scene. The delta into a segment from an unknown frame is unknown too: the
     segment's next delta stands in for it, which leaves a smaller error at keyframes than a delta of zero. The first
-    step of a scene is zero. `packed`: with the lean form of the encoder. `rows`: which are wanted. With `carried`, this
-    is a scene from `first_row` on that goes on with that of the call before.
+    step of a scene is zero. `packed`: with the lean form of the encoder. `rows`: which are wanted. With `encoders`,
+    these rows go on with those of the call before.
     """
     N, P = known.shape
     wanted, end, _ = rows.indices(N)
@@ -188,9 +201,7 @@ def known_tokens(
             seen = given.slice(low * TOKEN_FRAMES, limit * TOKEN_FRAMES).permute_agents(
                 torch.tensor(those, device=like.device)
             )
-            growing = None
-            if carried is not None:
-                growing = Growing(carried.setdefault(tuple(those), Carried()), first_row + low, limit - low)
+            growing = None if encoders is None else encoders.growing(those, low, limit)
             latent[:, first:last, those] = model.encode(seen, slice(first - low, last - low), packed, growing)
         low, stop = max(start, before), min(stop, end)
         if low >= stop:

@@ -48,6 +48,7 @@ from magnet.sampling.sampler import begin, run_stages
 from magnet.sampling.schedule import Stage
 from magnet.sampling.solvers import History
 from magnet.tasks.base import Task, schedule_of
+from magnet.tokenizer.carried import Carried
 
 CHUNK = 64
 """Token steps that are decoded at a time, so that scenes of up to 8.5 seconds are one chunk."""
@@ -211,7 +212,7 @@ class Rollout:
         self.noise = NoiseStream((B, P, layout.width), generator, model.device, eta=o.eta, scale=o.noise_scale or 1.0)
         check_condition(cond, scene.scenes, o.guidance.cond_weight)
         self.cond = None if cond is None else cond.to(model.device).repeat_interleave(samples, dim=0)
-        self.encoders: Encoders = {}
+        self.encoded: dict[tuple[int, ...], Carried] = {}
         self.stats.begin(B)
         self.first = self.stop = self.reached = 0  # one past the last row that has been generated
         self.there: float = self.length
@@ -364,7 +365,8 @@ class Rollout:
             related = None if self.related is None else mask_unknown(self.scene, self.related, low, high)
             part = slice(self.stop - low, last - low)
             limits, packed = self._limits(low, high, part), self.options.precision != "reference"
-            tokens = known_tokens(self.model, given, known, related, limits, packed, part, self.encoders, low)
+            encoders = Encoders(low, self.encoded)
+            tokens = known_tokens(self.model, given, known, related, limits, packed, part, encoders)
             tokens = tokens.repeat_interleave(self.samples, dim=0)
             init_noise, mask_noise = self.noise.draw(last - self.stop)
             new = begin(tokens, init_noise, known[part], self.model.layout)
