@@ -88,7 +88,7 @@ def test_independent_levels_hardly_show_a_past_and_a_mixture_does() -> None:
     generator = torch.Generator().manual_seed(0)
     shares = {}
     for distribution in ("per_token", "mixture"):
-        levels = draw_levels(NoiseOptions(distribution=distribution), 50_000, 16, 2, generator)
+        levels = draw_levels(NoiseOptions(distribution=distribution), (50_000, 16, 2), generator)
         shares[distribution] = past_of(levels, 0).flatten(1).any(dim=1).float().mean().item()
     assert shares["per_token"] == pytest.approx(1 / 500, rel=0.3)
     assert shares["mixture"] == pytest.approx(1 / 3, rel=0.3)

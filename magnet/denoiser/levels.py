@@ -56,8 +56,7 @@ def drawn(
     With places, one of each scene, a scene's are those of its place, whoever shares the batch; else of `draw_levels`.
     """
     if not places:
-        B, N, P, _ = shape
-        levels = draw_levels(noise, B, N, P, generator, present)
+        levels = draw_levels(noise, shape[:3], generator, present)
         return levels, torch.randn(shape, generator=generator, device=generator.device)
     found = []
     for b, place in enumerate(places):
@@ -67,9 +66,9 @@ def drawn(
 
 
 def draw_levels(
-    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
+    noise: NoiseOptions, shape: Sequence[int], generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
-    """Random levels for B scenes of N token steps and P agents. -> (B, N, P) int on the generator's device
+    """Random levels. -> (B, N, P) int on the generator's device
 
     `per_token`: all independent (paper 3.2). `per_timestep`: agents at a time step share one (A.6.2).
     `per_sequence`: one a scene. `mixture` (ours) draws for each scene one of these or a *roll-out*: a clean past, a
@@ -78,11 +77,11 @@ def draw_levels(
 
     Args:
         noise: how they are drawn.
-        B, N, P: scenes, token steps, agents.
+        shape: (B, N, P), scenes, token steps and agents.
         generator: source of all randomness.
         present: (B, P) bool: slots with somebody in them, of whom roll-outs generate one at least; None: all.
     """
-    device = generator.device
+    (B, N, P), device = shape, generator.device
 
     def uniform(*shape: int) -> Tensor:
         levels = torch.randint(LEVELS + 1, shape, generator=generator, device=device)
@@ -99,10 +98,10 @@ def draw_levels(
     which = drawn_kinds((token, step, noise.at_once, roll), (B, 1, 1), generator)
     levels = torch.where(which == PER_TOKEN, uniform(B, N, P), uniform(B, N, 1))
     levels = torch.where(which == PER_SEQUENCE, uniform(B, 1, 1), levels)
-    rolled = rollout_levels(noise, B, N, P, generator, present)
+    rolled = rollout_levels(noise, shape, generator, present)
     if noise.live:
         chosen = torch.rand(B, 1, 1, generator=generator, device=device) < noise.live
-        rolled = torch.where(chosen, live_levels(noise, B, N, P, generator, present), rolled)
+        rolled = torch.where(chosen, live_levels(noise, shape, generator, present), rolled)
     return torch.where(which == ROLLOUT, rolled, levels)
 
 
@@ -116,9 +115,10 @@ def drawn_kinds(shares: Sequence[float], shape: tuple[int, ...], generator: torc
 
 
 def drawn_roles(
-    shares: Sequence[float], B: int, P: int, generator: torch.Generator, present: Tensor | None = None
+    shares: Sequence[float], shape: Sequence[int], generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
-    """A role for each agent; one at least of those who are there is `GENERATED`. -> (B, 1, P) int"""
+    """A role for each agent; one at least of those who are there is `GENERATED`. shape (B, N, P) -> (B, 1, P) int"""
+    B, _, P = shape
     role = drawn_kinds(shares, (B, 1, P), generator)
     lot = torch.rand(B, 1, P, generator=generator, device=generator.device)
     if present is not None:
@@ -127,7 +127,7 @@ def drawn_roles(
 
 
 def rollout_levels(
-    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
+    noise: NoiseOptions, shape: Sequence[int], generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
     """Clean past, a block at a shared level or a ramp of levels, unknown future. -> (B, N, P) int
 
@@ -138,7 +138,7 @@ def rollout_levels(
     In a share `faint_past` of the scenes the past of those who are generated or hidden is at one level up to `FAINT`,
     in half of these from a random token on: as samplers show what was made some seconds ago (`stabilization_level`).
     """
-    device = generator.device
+    (B, N, P), device = shape, generator.device
 
     def integers(low: Tensor, high: Tensor) -> Tensor:
         """Uniform in [low, high], elementwise."""
@@ -169,14 +169,14 @@ def rollout_levels(
     generated = torch.where(time < past, behind, torch.where(time < stop, level, LEVELS)).expand(B, N, P)
     given = torch.where(time < stop, 0, LEVELS).expand(B, N, P)
     hidden = torch.where(time < past, behind, LEVELS).expand(B, N, P)
-    role = torch.where(mixed, drawn_roles(ROLES, B, P, generator, present), GENERATED)
+    role = torch.where(mixed, drawn_roles(ROLES, shape, generator, present), GENERATED)
     levels = torch.where(role == GIVEN_SO_FAR, given, generated)
     levels = torch.where(role == GIVEN, torch.zeros_like(levels), levels)
     return torch.where(role == HIDDEN, hidden, levels)
 
 
 def live_levels(
-    noise: NoiseOptions, B: int, N: int, P: int, generator: torch.Generator, present: Tensor | None = None
+    noise: NoiseOptions, shape: Sequence[int], generator: torch.Generator, present: Tensor | None = None
 ) -> Tensor:
     """A past, one or two token steps at one level, and an unknown future: what live tasks ask. -> (B, N, P) int
 
@@ -185,7 +185,7 @@ def live_levels(
     often where a window that moves along has it in short strides. The past of those who are not given is faint as in
     `rollout_levels`.
     """
-    device = generator.device
+    (B, N, _), device = shape, generator.device
     draw = torch.rand(6, B, 1, 1, generator=generator, device=device)
     time = torch.arange(N, device=device)[None, :, None]
     latest = max(N - 1 - UNKNOWN_AFTER, 1)
@@ -196,7 +196,7 @@ def live_levels(
     behind = torch.where(
         (draw[4] < noise.faint_past) & (time >= since), 1 + (draw[5] * FAINT).long().clamp_max(FAINT - 1), 0
     )
-    role = drawn_roles(LIVE_ROLES, B, P, generator, present)
+    role = drawn_roles(LIVE_ROLES, shape, generator, present)
     shown = torch.where(role == GIVEN_SO_FAR, 0, behind)
     block = torch.where(role == GENERATED, level, torch.where(role == GIVEN_SO_FAR, 0, LEVELS))
     return torch.where(time < past, shown, torch.where(time < stop, block, LEVELS))

@@ -21,31 +21,31 @@ MIXTURE = NoiseOptions("mixture")
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_levels_span_clean_to_pure_noise_and_follow_the_seed(kind, generator):
-    levels = draw_levels(NoiseOptions(kind), 4000, 4, 2, generator)
+    levels = draw_levels(NoiseOptions(kind), (4000, 4, 2), generator)
     assert levels.shape == (4000, 4, 2)
     assert (int(levels.min()), int(levels.max())) == (0, LEVELS)
-    again = [draw_levels(NoiseOptions(kind), 8, 4, 2, torch.Generator().manual_seed(1)) for _ in range(2)]
+    again = [draw_levels(NoiseOptions(kind), (8, 4, 2), torch.Generator().manual_seed(1)) for _ in range(2)]
     assert torch.equal(*again)
 
 
 def test_tokens_are_independent_time_steps_shared_sequences_equal(generator):
-    per_token = draw_levels(NoiseOptions("per_token"), 2000, 3, 2, generator).double().flatten(1)
+    per_token = draw_levels(NoiseOptions("per_token"), (2000, 3, 2), generator).double().flatten(1)
     correlation = torch.corrcoef(per_token.T) - torch.eye(6)
     assert correlation.abs().max() < 0.1
-    per_timestep = draw_levels(NoiseOptions("per_timestep"), 50, 3, 2, generator)
+    per_timestep = draw_levels(NoiseOptions("per_timestep"), (50, 3, 2), generator)
     assert torch.equal(per_timestep[..., 0], per_timestep[..., 1])
-    per_sequence = draw_levels(NoiseOptions("per_sequence"), 50, 3, 2, generator)
+    per_sequence = draw_levels(NoiseOptions("per_sequence"), (50, 3, 2), generator)
     assert (per_sequence == per_sequence[:, :1, :1]).all()
 
 
 def test_a_roll_out_is_a_clean_past_a_block_and_an_unknown_future(generator):
-    levels = rollout_levels(MIXTURE, 3000, 16, 2, generator)
+    levels = rollout_levels(MIXTURE, (3000, 16, 2), generator)
     assert (levels.diff(dim=1) >= 0).all()
     assert (levels[:, -1] == LEVELS).any() and (levels[:, 0] == 0).any()
 
 
 def test_more_roll_outs_begin_from_nothing_than_chance_gives(generator):
-    levels = rollout_levels(MIXTURE, 4000, 16, 2, generator)
+    levels = rollout_levels(MIXTURE, (4000, 16, 2), generator)
     alone, mixed = (share + (1 - share) / 16 for share in (MIXTURE.from_nothing, FROM_NOTHING_MIXED))
     given = (ROLES[1] + ROLES[2]) / 2  # in half of the scenes it is this one who is generated whatever is drawn
     expected = (1 - MIXED) * alone + MIXED * (1 - given) * mixed
@@ -56,7 +56,7 @@ def test_a_partner_from_nothing_is_trained_as_often_as_inpainting_needs(generato
     """One in seven roll-outs of two people gives one of them wholly and nothing of the other, in four slots too."""
     for slots in (2, 4):
         present = torch.arange(slots).expand(8000, slots) < 2
-        levels = rollout_levels(MIXTURE, 8000, 16, slots, generator, present=present)[..., :2]
+        levels = rollout_levels(MIXTURE, (8000, 16, slots), generator, present=present)[..., :2]
         given, lacking = (levels == 0).all(dim=1), (levels > 0).all(dim=1)
         assert ((given & lacking.flip(1)).any(dim=1)).double().mean() > 1 / 8
 
@@ -65,10 +65,10 @@ def test_a_partner_from_nothing_is_trained_as_often_as_inpainting_needs(generato
 def test_in_every_roll_out_somebody_who_is_there_is_generated(draw, generator):
     """Of two people in five slots, in any two of them."""
     present = torch.rand(4000, 5, generator=generator).argsort(dim=1) < 2
-    levels = draw(MIXTURE, 4000, 16, 5, generator, present=present)
+    levels = draw(MIXTURE, (4000, 16, 5), generator, present=present)
     generated = ((levels > 0) & (levels < LEVELS)).any(dim=1) & present
     assert generated.any(dim=1).double().mean() > 0.97  # level K, unknown as what follows it, is drawn once in a while
-    roles = drawn_roles((0.1, 0.9), 4000, 5, generator, present)[:, 0]
+    roles = drawn_roles((0.1, 0.9), (4000, 1, 5), generator, present)[:, 0]
     assert ((roles == 0) & present).any(dim=1).all()
     assert float((roles[~present] == 0).double().mean()) == pytest.approx(0.1, abs=0.02)
     assert float((roles[present] == 0).double().mean()) == pytest.approx(0.55, abs=0.02)
@@ -76,7 +76,7 @@ def test_in_every_roll_out_somebody_who_is_there_is_generated(draw, generator):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_shift_draws_high_levels_more_often_and_keeps_both_ends(kind, generator):
-    even, moved = (draw_levels(NoiseOptions(kind, shift), 4000, 4, 2, generator).double() for shift in (1.0, 3.0))
+    even, moved = (draw_levels(NoiseOptions(kind, shift), (4000, 4, 2), generator).double() for shift in (1.0, 3.0))
     assert (int(moved.min()), int(moved.max())) == (0, LEVELS)
     assert moved.mean() > even.mean() + 40
     if kind != "mixture":
@@ -84,7 +84,7 @@ def test_a_shift_draws_high_levels_more_often_and_keeps_both_ends(kind, generato
 
 
 def test_a_faint_past_is_at_one_level_up_to_the_faintest_and_those_who_are_given_stay_clean(generator):
-    levels = rollout_levels(NoiseOptions("mixture", faint_past=1.0), 6000, 16, 2, generator)
+    levels = rollout_levels(NoiseOptions("mixture", faint_past=1.0), (6000, 16, 2), generator)
     assert (levels[:, :, 0] == 0).all(dim=1).any()  # given to the end
     first, last = levels[:, 0, 0], levels[:, -1, 0]
     past = (first > 0) & (first <= FAINT) & (last == LEVELS) & (levels[:, 1, 0] == first)
@@ -98,7 +98,7 @@ def test_a_faint_past_is_at_one_level_up_to_the_faintest_and_those_who_are_given
 def test_so_many_pasts_are_faint_as_are_asked_for(generator):
     shares = []
     for faint in (0.0, 0.5, 1.0):
-        levels = rollout_levels(NoiseOptions("mixture", faint_past=faint), 20_000, 16, 2, generator)[:, :, 0]
+        levels = rollout_levels(NoiseOptions("mixture", faint_past=faint), (20_000, 16, 2), generator)[:, :, 0]
         shares.append(float(((levels > 0) & (levels <= FAINT)).any(dim=1).double().mean()))
     never, half, always = shares
     assert always - never > 0.1
@@ -106,7 +106,7 @@ def test_so_many_pasts_are_faint_as_are_asked_for(generator):
 
 
 def test_live_levels_are_a_past_one_or_two_tokens_and_an_unknown_future(generator):
-    levels = live_levels(NoiseOptions("mixture", 3.0), 4000, 16, 2, generator)
+    levels = live_levels(NoiseOptions("mixture", 3.0), (4000, 16, 2), generator)
     generated = (levels > 0) & (levels < LEVELS)
     assert set(generated.sum(dim=1).unique().tolist()) <= {0, 1, 2}
     assert (levels.diff(dim=1) >= 0).all()
@@ -117,14 +117,14 @@ def test_live_levels_are_a_past_one_or_two_tokens_and_an_unknown_future(generato
 
 
 def test_one_live_block_in_five_is_of_two_tokens(generator):
-    levels = live_levels(NoiseOptions("mixture"), 4000, 16, 2, generator)
+    levels = live_levels(NoiseOptions("mixture"), (4000, 16, 2), generator)
     length = ((levels > 0) & (levels < LEVELS)).sum(dim=1).amax(dim=1)
     length = length[length > 0]
     assert float((length == 2).double().mean()) == pytest.approx(0.2, abs=0.03)
 
 
 def test_live_levels_ask_what_each_live_task_asks(generator):
-    levels = live_levels(MIXTURE, 4000, 16, 2, generator)
+    levels = live_levels(MIXTURE, (4000, 16, 2), generator)
     begins = (levels > 0).any(dim=2).double().argmax(dim=1)
     first, second = levels[torch.arange(4000), begins].unbind(dim=1)
     busy = (first > 0) & (first < LEVELS)
@@ -135,7 +135,7 @@ def test_live_levels_ask_what_each_live_task_asks(generator):
 
 
 def test_a_live_past_is_faint_for_those_who_are_not_given(generator):
-    levels = live_levels(NoiseOptions("mixture", faint_past=1.0), 4000, 16, 2, generator)
+    levels = live_levels(NoiseOptions("mixture", faint_past=1.0), (4000, 16, 2), generator)
     dark = (levels == LEVELS).all(dim=2)
     begins = torch.where(dark.any(dim=1), dark.double().argmax(dim=1), 16) - 1  # the block's last
     last = levels[torch.arange(4000), begins]
@@ -151,14 +151,16 @@ def test_a_share_of_the_roll_outs_is_live(generator):
         busy = ((levels > 0) & (levels < LEVELS)).any(dim=2).sum(dim=1)
         return float((busy <= 2).double().mean())
 
-    few, many = (narrow(draw_levels(NoiseOptions("mixture", live=live), 4000, 16, 2, generator)) for live in (0.0, 0.5))
+    few, many = (
+        narrow(draw_levels(NoiseOptions("mixture", live=live), (4000, 16, 2), generator)) for live in (0.0, 0.5)
+    )
     assert many > few + 0.2
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_so_many_scenes_begin_from_nothing_as_are_asked_for(share, generator):
     """Of those in which everybody is generated; in the others `FROM_NOTHING_MIXED` do."""
-    levels = rollout_levels(NoiseOptions("mixture", from_nothing=share), 20_000, 16, 2, generator)
+    levels = rollout_levels(NoiseOptions("mixture", from_nothing=share), (20_000, 16, 2), generator)
     nothing = float((levels[:, 0] > 0).all(dim=1).double().mean())
     alone, mixed = (each + (1 - each) / 16 for each in (share, FROM_NOTHING_MIXED))
     both = 1 - ROLES[1] - ROLES[2]
@@ -168,7 +170,7 @@ def test_so_many_scenes_begin_from_nothing_as_are_asked_for(share, generator):
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_so_many_blocks_fill_the_window_as_are_asked_for(share, generator):
     """Of those at one level, of scenes in which everybody is generated; the others end anywhere."""
-    levels = rollout_levels(NoiseOptions("mixture", from_nothing=1.0, to_end=share), 40_000, 16, 2, generator)
+    levels = rollout_levels(NoiseOptions("mixture", from_nothing=1.0, to_end=share), (40_000, 16, 2), generator)
     active = (levels > 0) & (levels < LEVELS)
     alike = (levels[:, :, 0] == levels[:, :, 1]).all(dim=1) & active[:, 0].all(dim=1)
     stop = active.all(dim=2).sum(dim=1)
@@ -181,6 +183,6 @@ def test_so_many_blocks_fill_the_window_as_are_asked_for(share, generator):
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
 def test_so_many_scenes_are_at_one_level_as_are_asked_for(share, generator):
-    levels = draw_levels(NoiseOptions("mixture", at_once=share, from_nothing=0.0), 20_000, 16, 2, generator)
+    levels = draw_levels(NoiseOptions("mixture", at_once=share, from_nothing=0.0), (20_000, 16, 2), generator)
     one = (levels == levels[:, :1, :1]).flatten(1).all(dim=1)
     assert float(one.double().mean()) == pytest.approx(share, abs=0.02)
