@@ -13,9 +13,9 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.generation.conditioning import receptive_field
 from magnet.generation.rollout import Rollout
 from magnet.generation.settling import PACE, carried_on
-from magnet.motion.frames import canonical_frame, pairwise, to_9d
+from magnet.motion.frames import canonical_frame
 from magnet.motion.scene import Scene, cat_time
-from magnet.motion.tokens import TOKEN_FRAMES, pairwise_by_token
+from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.sampling.noise import LEVELS
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage
@@ -183,13 +183,11 @@ class OwnRollout(Rollout):
             moved = torch.zeros_like(world.placed)
             moved[local:stop, slot] = world.placed[local:stop, slot]
             held = self.tokens[:, local:stop]
-            frames = slice(local * TOKEN_FRAMES, stop * TOKEN_FRAMES)
-            pairs = pairwise_by_token(to_9d(pairwise(world.T_world_can[:, frames])))
             latents = held.new_zeros(*held.shape[:3], layout.latent)
-            made = self.model.tokens_of(latents, world.placed_deltas(local, stop), pairs)
+            made = self.model.tokens_of(latents, world.placed_deltas(local, stop), world.implied(local, stop))
             made[..., : layout.latent] = held[..., : layout.latent]
             made[0, 0, slot, : layout.latent] = latent.to(made)
-            changed = layout.spread(world._ready(local, stop) & world._touched(moved[local:stop])).to(made.device)
+            changed = layout.spread(world.changed(moved[local:stop], local, stop)).to(made.device)
             self.tokens[:, local:stop] = torch.where(changed, made, held)
         return True
 

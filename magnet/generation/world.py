@@ -90,8 +90,8 @@ class WorldState(Places):
         begin = int(moved.any(dim=1).nonzero()[0, 0])
         if begin < first:  # a gap longer than the window has been closed, which moves its earlier frames too
             latent = torch.cat([self.model.parts_of(tokens[:, begin:first])[0], latent], dim=1)
-        implied = self._implied(begin, stop)
-        changed = (self._ready(begin, stop) & self._touched(moved[begin:stop])).to(tokens.device)
+        implied = self.implied(begin, stop)
+        changed = self.changed(moved[begin:stop], begin, stop).to(tokens.device)
         if self.model.layout.slots and self.stats is not None:
             new = finished[first:stop].to(tokens.device) if decentralized else None
             self._count_drift(pairs, implied[:, first - begin :], changed[first - begin :], new)
@@ -108,7 +108,7 @@ class WorldState(Places):
             self.stats.add_quantization_error(latent, code, new & self.given.present[:, None])
         return torch.where(new[..., None], code, latent)
 
-    def _implied(self, first: int, stop: int) -> Tensor:
+    def implied(self, first: int, stop: int) -> Tensor:
         """Pairwise transforms of some tokens as people stand in the world. -> (B, n, P, slots, 4, 9)"""
         partner = self.model.layout.partners(self.T_world_can.device)
         return pairwise_by_token(
@@ -197,19 +197,18 @@ class WorldState(Places):
         tokens[:, first:until] = torch.where(entered[..., None] & delta, true, tokens[:, first:until])
         return tokens
 
-    def _ready(self, first: int, stop: int) -> Tensor:
-        """Groups of tokens that concern placed agents only. -> (n, P, 1 + slots) bool"""
-        own = self.placed[first:stop, :, None]
-        if not self.model.layout.slots:
-            return own.clone()
-        return torch.cat([own, own & self.placed[first:stop][:, self.model.layout.partners()]], dim=-1)
+    def changed(self, moved: Tensor, first: int, stop: int) -> Tensor:
+        """Groups of tokens [first, stop) that concern an agent that moved, and only agents that are placed.
 
-    def _touched(self, moved: Tensor) -> Tensor:
-        """Groups of tokens that concern an agent that moved. moved (n, P) -> (n, P, 1 + slots) bool"""
-        own = moved[..., None]
+        moved (n, P) bool -> (n, P, 1 + slots) bool
+        """
+        placed = self.placed[first:stop]
+        own = (placed & moved)[..., None]
         if not self.model.layout.slots:
             return own
-        return torch.cat([own, own | moved[:, self.model.layout.partners()]], dim=-1)
+        partner = self.model.layout.partners()
+        both, either = placed[..., None] & placed[:, partner], moved[..., None] | moved[:, partner]
+        return torch.cat([own, both & either], dim=-1)
 
     def scene(self, tokens: Tensor, first: int = 0, stop: int | None = None, before: Scene | None = None) -> Scene:
         """Bodies in the world of rows [first, stop) of the finished tokens; by default of all rows.
