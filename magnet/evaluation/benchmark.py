@@ -14,9 +14,11 @@ from torch import Tensor
 from magnet.datamodules.base import Clip, MotionDataModule, Split
 from magnet.datamodules.cmu import CMU
 from magnet.datamodules.options import HeldOutScenes
-from magnet.evaluation.scoring import Sight, planned
+from magnet.evaluation.scoring import Sight
 from magnet.files import save_npz
+from magnet.generation.plan import plan_of_frames
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.sampling.schedule import MaskSchedule
 from magnet.tasks import registry
 from magnet.tasks.base import Task
 
@@ -81,16 +83,18 @@ class Benchmark:
         task: Task = registry.get(name)()
         return task
 
+    def plan(self, task: str, people: int | None = None) -> MaskSchedule:
+        """What a task knows of a scene and makes of it."""
+        return plan_of_frames(self.task(task), people or self.people, self.context_frames, self.horizon_frames)
+
     def sight(self, task: str, people: int | None = None) -> Sight:
         """Which frames of whom a task gives, and which it asks for."""
-        plan = planned(self.task(task), self.context_frames, self.horizon_frames, people or self.people)
-        return Sight.of(plan, self.context_frames, self.horizon_frames)
+        return Sight.of(self.plan(task, people), self.context_frames, self.horizon_frames)
 
     def known(self, task: str) -> Tensor:
         """Which frames of whom a method may read. -> (context + horizon, P) bool"""
         frames = self.context_frames + self.horizon_frames
-        known = planned(self.task(task), self.context_frames, self.horizon_frames, self.people).known
-        return known.repeat_interleave(TOKEN_FRAMES, dim=0)[:frames]
+        return self.plan(task).known.repeat_interleave(TOKEN_FRAMES, dim=0)[:frames]
 
     def check(self, datamodule: MotionDataModule) -> None:
         """Check that the test scenes are those of the benchmark.

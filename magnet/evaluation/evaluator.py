@@ -27,11 +27,11 @@ from magnet.evaluation.scoring import (
     aligned,
     generators_of,
     in_slots,
-    planned,
     shared_world,
     slots_of,
 )
 from magnet.generation.inputs import other_body
+from magnet.generation.plan import plan_of_frames
 from magnet.generation.rollout import generate
 from magnet.generation.stats import SamplingStats
 from magnet.metrics.interval import Unit
@@ -181,7 +181,7 @@ class Evaluator(L.LightningModule):
         """The task's plan for scenes of so many frames, of people in the first `slots` slots; by default in all."""
         model = self.denoiser
         agents = model.layout.agents if slots is None else slots
-        return planned(self.task, context, horizon, agents, model.window, self.sampler.filled(model.sampling))
+        return plan_of_frames(self.task, agents, context, horizon, model.window, self.sampler.filled(model.sampling))
 
     def sees(self, slots: int) -> Sight:
         """What the task gives and what it generates, of people in the first `slots` slots."""

@@ -6,7 +6,8 @@ from magnet.baselines.predictor import Predictor
 from magnet.datamodules.base import MotionDataModule
 from magnet.denoiser.core import DenoiserCore
 from magnet.evaluation.evaluator import Evaluator
-from magnet.evaluation.scoring import Scoring, Sight, planned
+from magnet.evaluation.scoring import Scoring, Sight
+from magnet.generation.plan import plan_of_frames
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.base import Task
 
@@ -16,7 +17,7 @@ BASELINES = ("NN", "RS", "zero velocity", "ridge")
 def sight_of(task: Task, datamodule: MotionDataModule, people: int) -> Sight:
     """Which frames of whom a task gives in a data set's test scenes, and which it asks for."""
     context, horizon = datamodule.test.context_frames, datamodule.test.horizon_frames
-    return Sight.of(planned(task, context, horizon, people), context, horizon)
+    return Sight.of(plan_of_frames(task, people, context, horizon), context, horizon)
 
 
 def baseline(name: str, task: Task, datamodule: MotionDataModule) -> Predictor:

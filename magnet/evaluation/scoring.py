@@ -28,11 +28,8 @@ from magnet.metrics.registry import MEMORISATION, stems
 from magnet.motion.frames import canonical_frame, from_planar, inverse, to_planar
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES
-from magnet.sampling.grid import planning_grid
-from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import MaskSchedule
 from magnet.seeding import derive
-from magnet.tasks.base import Task, schedule_of
 
 
 def in_slots(scene: Scene, slots: int) -> Scene:
@@ -88,16 +85,6 @@ ENOUGH_WINDOWS = 1500
 
 MAX_SHOWN = 400
 """So many of them, evenly spread, are measured in place of samples, or as many as there are samples."""
-
-
-def planned(
-    task: Task, context: int, horizon: int, agents: int, window: int = 16, sampler: SamplerOptions | None = None
-) -> MaskSchedule:
-    """A task's plan for scenes of so many frames and people."""
-    tokens = -(-(context + horizon) // TOKEN_FRAMES)
-    return schedule_of(
-        task, planning_grid(tokens, agents, context // TOKEN_FRAMES, window, sampler or SamplerOptions())
-    )
 
 
 @dataclass(frozen=True)

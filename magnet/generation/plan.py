@@ -42,10 +42,17 @@ def plan_of_scene(
     Raises:
         ValueError: the task makes no sense at these sizes.
     """
-    tokens = -(-(context + frames) // TOKEN_FRAMES)
     model = denoiser_of(model)
-    options = options.filled(model.sampling)
-    return schedule_of(task, planning_grid(tokens, agents, context // TOKEN_FRAMES, model.window, options))
+    return plan_of_frames(task, agents, context, frames, model.window, options.filled(model.sampling))
+
+
+def plan_of_frames(
+    task: Task, agents: int, context: int, frames: int, window: int = 16, options: SamplerOptions | None = None
+) -> MaskSchedule:
+    """As `plan_of_scene`, of any model that sees `window` token steps."""
+    tokens = -(-(context + frames) // TOKEN_FRAMES)
+    grid = planning_grid(tokens, agents, context // TOKEN_FRAMES, window, options or SamplerOptions())
+    return schedule_of(task, grid)
 
 
 def planned(schedule: MaskSchedule) -> Plan:

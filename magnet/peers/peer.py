@@ -15,14 +15,13 @@ from magnet.denoiser.losses import token_losses
 from magnet.denoiser.token_model import TokenModel
 from magnet.generation.conditioning import mask_unknown
 from magnet.generation.inputs import whole_tokens
+from magnet.generation.plan import plan_of_frames
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout
 from magnet.peers.network import PeerNetwork
-from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import ddim_levels, ddim_step
-from magnet.sampling.options import SamplerOptions
 from magnet.seeding import derive, step_generator
-from magnet.tasks.base import Task, schedule_of
+from magnet.tasks.base import Task
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.training.optim import warmup_cosine
 from magnet.training.options import OptimizerOptions, group_of, plain
@@ -170,9 +169,7 @@ class Peer(TokenModel):
         Raises:
             ValueError: the method cannot do this task.
         """
-        tokens = -(-(context + horizon) // TOKEN_FRAMES)
-        grid = planning_grid(tokens, 2, context // TOKEN_FRAMES, self.window, SamplerOptions())
-        known = schedule_of(task, grid).known[:tokens]
+        known = plan_of_frames(task, 2, context, horizon, self.window).known
         self.require(known)
         return known
 
