@@ -129,11 +129,11 @@ class Speed:
     memory_mib: float | None
 
 
-def paper_model(max_agents: int = 4, seed: int = 0) -> DenoiserCore:
+def paper_model() -> DenoiserCore:
     """An untrained denoiser and tokenizer at the paper's sizes: as fast as trained ones, and as good as noise."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        tokenizer, model = TokenizerCore(), DenoiserCore(max_agents=max_agents)
+        torch.manual_seed(0)
+        tokenizer, model = TokenizerCore(), DenoiserCore(max_agents=4)
         for part in (tokenizer.vqvae.pose, tokenizer.vqvae.deltas, tokenizer.vqvae.betas):
             part.set(torch.zeros_like(part.mean), torch.ones_like(part.std))
         tokenizer.get_buffer("quantizer.codes").normal_()
@@ -315,7 +315,7 @@ ALONE = ("joint_future", "generation", "inbetweening", "agentic_sync", "agentic_
 """Tasks that one person alone can be sampled by."""
 
 
-def live_latency(model: DenoiserCore, options: SamplerOptions, seconds: float, people: int = 2) -> dict[str, Any]:
+def live_latency(model: DenoiserCore, options: SamplerOptions, seconds: float) -> dict[str, Any]:
     """Latency of a partner who answers each token as it happens, against the clock of the motion.
 
     The frames of a token are there when the last of them has happened. An answer is late where the next token is there
@@ -327,7 +327,7 @@ def live_latency(model: DenoiserCore, options: SamplerOptions, seconds: float, p
     """
     from magnet.generation.partner import Partner
 
-    past = standing(1, CONTEXT, people, model.device)
+    past = standing(1, CONTEXT, 2, model.device)
     partner = Partner(model, past, (0,), options, torch.Generator(model.device).manual_seed(0))
     coming = past.slice(CONTEXT - TOKEN_FRAMES)
     period = TOKEN_FRAMES / past.fps

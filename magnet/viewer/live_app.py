@@ -75,7 +75,6 @@ class LiveApp(ViewerBase):
 
     Args:
         live: the engine, whose model belongs to `body`.
-        ahead: frames generated ahead of the shown one.
         examples: scenes to begin from, by name.
         example: the one that `live` started from.
     """
@@ -87,7 +86,6 @@ class LiveApp(ViewerBase):
         host: str = "127.0.0.1",
         port: int = 8080,
         render: RenderOptions | None = None,
-        ahead: int = 32,
         examples: Mapping[str, Path] | None = None,
         example: str | None = None,
     ) -> None:
@@ -96,7 +94,7 @@ class LiveApp(ViewerBase):
         self.example = example or NOTHING
         scene, self.version = live.now()
         self.clock = Clock(scene.frames, scene.fps, growing=True, loop=False)
-        self.worker = Worker(live, ahead, self._refused, self._made)
+        self.worker = Worker(live, failed=self._refused, done=self._made)
         self.refusal, self.news = "", ""
         self.again: int | None = None  # the frame to play from, once what has been made anew is on the stage
         self.casts: dict[tuple[float, ...], SceneView] = {}
