@@ -36,6 +36,7 @@ class BodyDepth(ClipMeans):
     0.0
     """
 
+    higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
         "depth_p99": Column("depth 99 %", "m", "low", "99th percentile of how deep two bodies are in each other"),
         "depth_p99_in_contact": Column("depth in contact", "m", "low", "the same over frames of at least 5 cm"),

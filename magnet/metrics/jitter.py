@@ -58,6 +58,7 @@ class Jolts(ClipMeans):
     1.0
     """
 
+    higher_is_better = False
     columns: ClassVar[Mapping[str, Column]] = {
         "jolts": Column("jolts", "", "low", "share of frames with a pelvis that accelerates by over 32 m/s²"),
     }

@@ -176,3 +176,16 @@ def test_arrays_and_no_samples_are_refused_by_name() -> None:
         PositionError().update(generated, truth, present, agents=[True, False])
     with pytest.raises(ValueError, match="got 0 samples, expected at least one"):
         PositionError().update(generated[:0], truth, present)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_joint_that_is_not_finite_is_refused_by_its_place(value: float) -> None:
+    batch = draw_batch()
+    for which, name in ((0, "generated"), (1, "truth")):
+        spoilt = [each.clone() for each in batch]
+        spoilt[which][..., 1, 7, 1, 4, 2] = value
+        with pytest.raises(ValueError, match=rf"^{name}: joint 4 of agent 1, frame 7, scene 1 of the batch"):
+            PositionError().update(*spoilt)
+    batch[0][2, 1, 7, 1, 4, 2] = value  # one of the samples is enough
+    with pytest.raises(ValueError, match=r"^generated: joint 4 of agent 1, frame 7, scene 1 of the batch"):
+        PositionError().update(*batch)

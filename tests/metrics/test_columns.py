@@ -33,3 +33,10 @@ def test_a_part_and_an_end_compare_as_the_number_itself_does() -> None:
         assert beside(name, known) == "recording"
     assert beside("level_high", known) == "samples" and beside("level_low", known) == ""
     assert beside("offset", known) == beside("unknown_low", known) == ""
+
+
+def test_torchmetrics_is_told_the_same_direction_as_a_table() -> None:
+    """Its `MetricTracker` takes the best value by `higher_is_better`."""
+    told = {"low": False, "high": True, "real": None}
+    for metric in all_metrics().values():
+        assert metric.higher_is_better is told[next(iter(metric.columns.values())).better], type(metric).__name__

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torchmetrics import MetricCollection
 
-from magnet.metrics import MotionMetric
+from magnet.metrics import Column, MotionMetric
 from magnet.metrics.guarded import Guarded, guarded, lost_numbers
 from tests.metrics.batches import draw_batch
 from tests.metrics.test_registry import Calls, Heads
@@ -35,6 +35,15 @@ class Bare(Heads):
 class Twice(Heads):
     def measure(self, futures):
         return super().measure(futures) * 2
+
+
+class Half(Heads):
+    """The first of its two names is as it should be."""
+
+    columns: ClassVar = {"one": Column("one", "m", "low", "one"), "two": Column("two", "m", "low", "two")}
+
+    def measure(self, futures):
+        return [*super().measure(futures), None]
 
 
 class Framewise(Heads):
@@ -74,6 +83,7 @@ def made(kind: type[MotionMetric], name: str = "theirs") -> Guarded:
         (Exits, "SystemExit: bye"),
         (Bare, r"TypeError: Bare.measure gave \[a tensor \(3,\), a tensor \(3,\)\], expected a list of a pair"),
         (Twice, "TypeError: Twice.measure gave .* for each of head_height"),
+        (Half, r"TypeError: Half.measure gave .*, expected a list of a pair .* for each of one, two"),
         (Framewise, r"expected a list of a pair .* tensors of shape \(3,\)"),
         (Computes, "RuntimeError: "),
         (Number, r"TypeError: compute\(\) gave Tensor, expected a dict of one number a name"),

@@ -89,3 +89,15 @@ def test_what_is_not_scored_does_not_count(train: Scene) -> None:
     scored[:, 6:12] = False
     assert measured(train, known, made, scored) < 1e-5 < 1.0 < measured(train, known, made)
     assert math.isnan(measured(train, known, made, torch.zeros_like(scored)))
+
+
+def test_the_nearest_is_over_the_frames_that_windows_have() -> None:
+    """Two windows of three frames, futures of five: one window is 0.5 m off in all of them, the other in one alone."""
+    futures, scored = torch.zeros(2, 5, 1, 21, 3), torch.ones(5, 1, dtype=torch.bool)
+    futures[1, 3:] = 7.0
+    windows = torch.zeros(2, 3, 1, 21, 3)
+    windows[0, ..., 0] = 0.5
+    windows[1, 2, ..., 2] = 0.5
+    assert memorisation.nearest_distance(futures, windows, scored).tolist() == pytest.approx([0.5 / 3] * 2)
+    scored[:3] = False
+    assert memorisation.nearest_distance(futures, windows, scored).tolist() == [math.inf] * 2

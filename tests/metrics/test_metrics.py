@@ -295,6 +295,25 @@ def test_still_coordinates_are_left_out_of_interaction_and_counted() -> None:
     assert all(map(math.isfinite, got.values()))
 
 
+def test_still_coordinates_inside_clips_are_counted_in_every_sample() -> None:
+    generated, truth, present = draw_batch(people=2)  # 4 samples of 3 scenes
+    generated[..., 0, 5, 1] = 1.7
+    truth[..., 1, 7, 2] = 0.3
+    assert result(MotionInteraction(per_clip=True), generated, truth, present)["mi_left_out"] == 4 * 3 + 3
+
+
+@pytest.mark.parametrize("per_clip", [False, True])
+def test_two_who_are_never_there_together_leave_nothing_out_of_interaction(per_clip: bool) -> None:
+    generated, truth, present = draw_batch(scenes=1)  # whose last agent is absent
+    assert result(MotionInteraction(per_clip), generated, truth, present)["mi_left_out"] == 0
+
+
+def test_people_beyond_the_farthest_bin_are_as_far_apart_as_it() -> None:
+    generated, truth, present = draw_batch(people=2)
+    generated[..., 1, :, 0] += 100.0
+    assert result(PartnerDistance(), generated, truth, present)["partner_distance"] == pytest.approx(20.0, abs=0.006)
+
+
 def test_feet_of_no_frame_skate_at_no_speed_rather_than_at_zero() -> None:
     batch = draw_batch()
     nobody = torch.zeros(3, 20, 3, dtype=torch.bool)
