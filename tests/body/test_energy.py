@@ -71,6 +71,30 @@ def test_the_energy_falls_as_people_leave_each_other_and_its_slope_points_apart(
     assert slope[0] > 0 > slope[1], "the one at 0 goes left, the other right"
 
 
+def test_the_energy_of_many_is_that_of_every_two_who_are_there() -> None:
+    """Two couples, each in each other, and a kilometre between them."""
+    one, two = standing(0.10), standing(0.25)
+    away = two.T_world_root.clone()
+    away[..., 0, 3] += 1000.0
+    four = Scene(
+        torch.cat([one.body_rot, two.body_rot], dim=2),
+        torch.cat([one.T_world_root, away], dim=2),
+        torch.zeros(1, 4, 10),
+        torch.ones(1, 4, dtype=torch.bool),
+    )
+    torch.testing.assert_close(energy_of(four), energy_of(one) + energy_of(two), rtol=1e-2, atol=0.0)
+    absent = four.replace(present=torch.tensor([[True, True, True, False]]))
+    torch.testing.assert_close(energy_of(absent), energy_of(one), rtol=1e-4, atol=0.0)
+
+
+def test_the_energy_has_a_finite_slope_where_axes_cross() -> None:
+    ends = torch.zeros(1, 1, 2, len(PARTS), 2, 3).requires_grad_()  # all in one point
+    radius = torch.full((1, 2, len(PARTS)), 0.1)
+    energy = terms.pair_energy(ends, radius, torch.ones(1, 1, 2, dtype=torch.bool), CONTACT["firm"])
+    energy.sum().backward()
+    assert float(energy.detach()) > 0 and ends.grad.isfinite().all()
+
+
 def test_a_forearm_in_ones_own_trunk_costs() -> None:
     scene = standing(2.0)
     body_rot = scene.body_rot.clone()

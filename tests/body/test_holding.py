@@ -106,6 +106,26 @@ def test_of_two_whom_a_hand_could_hold_it_holds_who_is_longer_near(longer: int) 
     assert held[:, longer].all() and not held[:, 1 - longer].any()
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "who"),
+    [
+        (near((30, 0.19)), near((12, 0.05), (18, 9.0)), 0),  # longer, and less near
+        (near((30, 0.19)), near((30, 0.05)), 1),  # as long, and nearer
+        (near((12, 0.19), (5, 9.0), (13, 0.19)), near((12, 0.05), (18, 9.0)), 0),  # far off in a short break
+    ],
+)
+def test_a_hand_holds_who_is_near_for_long_and_short_breaks_cost_nothing(
+    first: Tensor, second: Tensor, who: int
+) -> None:
+    joints = standing_people(frames=30, agents=3).clone()
+    hands = hand_points(joints)
+    for p, offset in ((0, first), (1, -second)):
+        aside = torch.stack([offset, torch.zeros(30), torch.zeros(30)], dim=-1)
+        joints[:, :, p] += (hands[:, :, 2, 1] - hands[:, :, p, 0] + aside)[:, :, None]
+    held = lasting_holds(joints, torch.ones(1, 3, dtype=torch.bool), FPS)[0][0, :, 1:, 0, 1]  # the last one's right
+    assert held[:12, who].all() and not held[:12, 1 - who].any()
+
+
 def test_nobody_holds_who_is_not_there() -> None:
     joints = two_people(near((20, 0.1)))
     assert not lasting_holds(joints, torch.tensor([[True, False]]), FPS)[0].any()

@@ -13,7 +13,7 @@ from magnet.body.fitted_capsules import fit_capsules, with_measured
 from magnet.body.holding import between_hands
 from magnet.body.settle_goals import Goals
 from magnet.body.settle_options import Settle
-from magnet.body.settle_residuals import Residuals, Seen, all_residuals, limits, unmet
+from magnet.body.settle_residuals import Residuals, Seen, all_residuals, limits, touching, unmet
 from magnet.body.settle_wishes import Wishes
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -92,3 +92,44 @@ def test_limits_that_are_kept_are_those_of_the_contact() -> None:
         assert within[len(own) :].isinf().all()
         assert within[:, len(own) :].isinf().all()
         assert not between.is_inference()
+
+
+def test_a_depth_changes_as_it_says_when_somebody_moves() -> None:
+    """`value` by `along` . (d point - d other_point), of unit length: here somebody goes a tenth of a millimetre."""
+    scene, step = handshake(), torch.tensor([6e-5, 0.0, -8e-5])
+    root = scene.T_world_root.clone()
+    root[:, :, 2, :3, 3] += step
+    wishes = Wishes.of(scene, BODY, "hold")
+    capsules = with_measured(fit_capsules(BODY, scene.betas), BODY.rest_joints(scene.betas[:, None]))
+    everybody = torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool)
+    goals = Goals.of(wishes, everybody, Settle())
+    before, after = (
+        touching(seen(each), capsules, goals, wishes.contact) for each in (scene, scene.replace(T_world_root=root))
+    )
+    torch.testing.assert_close(before.along.norm(dim=-1), torch.ones(len(before.along)))
+    moved = (before.node % 3 == 2).float() - (before.other % 3 == 2).float()
+    keys = [
+        list(map(tuple, torch.stack([each.node, each.other, each.bone, each.other_bone], dim=-1).tolist()))
+        for each in (before, after)
+    ]
+    # Those of which there is one, before and after: some come near enough to count, others leave.
+    places = [(keys[0].index(key), keys[1].index(key)) for key in keys[0] if [k.count(key) for k in keys] == [1, 1]]
+    was, now = torch.tensor(places).unbind(dim=1)
+    change, expected = after.value[now] - before.value[was], moved[was] * (before.along[was] @ step)
+    assert len(was) > 100 and int((expected.abs() > 2e-5).sum()) > 10
+    torch.testing.assert_close(change, expected, atol=1e-6, rtol=0.0)
+
+
+def test_hard_is_a_factor_of_depth_between_people_alone() -> None:
+    scene = handshake()
+    wishes = Wishes.of(scene, BODY, "hold")
+    capsules = with_measured(fit_capsules(BODY, scene.betas), BODY.rest_joints(scene.betas[:, None]))
+    everybody = torch.ones(scene.T_world_root.shape[:3], dtype=torch.bool)
+    plain, hard = (
+        touching(seen(scene), capsules, Goals.of(wishes, everybody, Settle(hard=each)), wishes.contact)
+        for each in (1.0, 9.0)
+    )
+    between = plain.node != plain.other
+    assert between.any() and not between.all()
+    assert torch.allclose(hard.root_weight, torch.where(between, 3.0, 1.0) * plain.root_weight)
+    assert float(plain.root_weight[between].min()) > float(plain.root_weight[~between].max())

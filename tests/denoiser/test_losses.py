@@ -205,6 +205,10 @@ def test_the_near_loss_counts_metres_and_radians_by_distance_and_by_what_was_sho
     expected = alpha_bar(torch.tensor(300)) * (off / (NEAR + distance)).mean()
     got = near_loss(clean, truth, LAYOUT, everybody(scene), levels)
     assert got == pytest.approx(float(expected), rel=1e-3)
+    levels[..., 1], levels[..., 2] = 200, 700  # each pair by its own level
+    shown = alpha_bar(torch.tensor([200, 700]))
+    expected = (shown * off / (NEAR + distance)).mean()
+    assert near_loss(clean, truth, LAYOUT, everybody(scene), levels) == pytest.approx(float(expected), rel=1e-3)
     assert near_loss(truth, truth, LAYOUT, everybody(scene), levels) < 1e-4
     assert near_loss(clean, truth, LAYOUT, torch.zeros_like(everybody(scene)), levels) == 0
     assert near_loss(clean, truth, LAYOUT, everybody(scene), torch.full_like(levels, 1000)) < 1e-6

@@ -1,7 +1,9 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from magnet.body import load_body
 from magnet.body.joints import ELBOWS, WRISTS
@@ -98,3 +100,61 @@ def test_the_hand_term_is_how_far_the_middles_of_the_hands_are_off(body, generat
     expected = torch.stack([(hands[1] - hands[0]).norm(dim=-1), (hands[3] - hands[2]).norm(dim=-1)]).mean()
     got = reconstruction_losses(off, pose, mask, joints)["hand"]
     assert got > 0.02 and got == pytest.approx(float(expected), rel=1e-3)
+
+
+def test_joint_and_velocity_terms_are_metres_and_metres_a_second(generator):
+    """Of made-up joints, those that count: somebody's last frames do not, nor steps into or out of them."""
+    truth, decoded = torch.randn(2, 2, 6, 3, 135, generator=generator)
+    mask = torch.ones(2, 6, 3, dtype=torch.bool)
+    mask[1, 4:, 2] = mask[0, 2, 0] = False
+
+    def joints(pose: torch.Tensor) -> torch.Tensor:
+        return pose[..., :66].unflatten(-1, (22, 3))
+
+    got = reconstruction_losses(decoded, truth, mask, joints)
+    away = (joints(decoded) - joints(truth)).double().numpy()
+    lengths, slips, of_feet = [], [], []
+    for b, t, p in np.ndindex(2, 6, 3):
+        if mask[b, t, p]:
+            lengths += [np.linalg.norm(away[b, t, p, j]) for j in range(22)]
+        if t and mask[b, t, p] and mask[b, t - 1, p]:
+            slip = 30 * np.linalg.norm(away[b, t, p] - away[b, t - 1, p], axis=-1)
+            slips += slip.tolist()
+            of_feet += slip[[7, 8, 10, 11]].tolist()  # ankles and toes of SMPL
+    for name, expected in (("joint", lengths), ("velocity", slips), ("foot_velocity", of_feet)):
+        assert float(got[name]) == pytest.approx(np.mean(expected), rel=1e-4), name
+
+
+def test_rotation_terms_are_quadratic_up_to_one_radian_and_linear_above():
+    """One joint of 21 is turned, and the root as far; angles by SciPy. Eq. 4 with its smooth L1."""
+    for angle in (0.4, 2.0):
+        turned = torch.from_numpy(Rotation.from_rotvec([0, 0.6 * angle, 0.8 * angle]).as_matrix()).float()
+        truth = torch.eye(3)[:, :2].T.flatten().repeat(22)
+        truth = torch.cat([truth, torch.tensor([0.1, 0.9, 0.2])])
+        decoded = truth.clone()
+        decoded[5 * 6 : 6 * 6] = decoded[21 * 6 : 22 * 6] = 3 * turned[:, :2].T.flatten()  # of any length
+        decoded[-3:] += torch.tensor([0.3, 0.0, 1.7])
+        losses = reconstruction_losses(decoded[None, None, None], truth[None, None, None], torch.ones(1, 1, 1).bool())
+        smooth = angle**2 / 2 if angle < 1 else angle - 0.5
+        assert float(losses["joint_rotation"]) == pytest.approx(smooth / 21, rel=1e-4)
+        assert float(losses["root_rotation"]) == pytest.approx(smooth, rel=1e-4)
+        assert float(losses["root_translation"]) == pytest.approx((0.3**2 / 2 + 1.7 - 0.5) / 3, rel=1e-4)
+
+
+def test_frames_that_do_not_count_may_hold_anything_and_pull_at_nothing(body, generator):
+    """NaN of a recording reaches a gradient even where a loss leaves it out: 0 times NaN is NaN."""
+    scene = random_scene(1, 6, 2, generator)
+    truth, mask = pose_features(scene), torch.ones(1, 6, 2, dtype=torch.bool)
+    mask[0, 2:4, 1] = False
+
+    def joints(pose: torch.Tensor) -> torch.Tensor:
+        return body.forward_kinematics(*matrices(pose), scene.betas[:, None])
+
+    slopes = []
+    for filler in (0.5, torch.nan):
+        decoded = (truth + 0.1).requires_grad_()
+        recorded = torch.where(mask[..., None], truth, filler)
+        losses = reconstruction_losses(decoded, recorded, mask, joints, scene_deltas(scene), scene_deltas(scene))
+        sum(losses.values()).backward()
+        slopes.append(decoded.grad)
+    assert torch.equal(*slopes) and slopes[0][mask].any() and not slopes[0][~mask].any()

@@ -81,6 +81,19 @@ def test_dead_codes_come_back_as_vectors_of_the_batch(generator: torch.Generator
     assert (vectors == book.codes[0, 3]).all(-1).any()
 
 
+def test_any_unmasked_vector_may_take_a_dead_codes_place_and_no_other(generator: torch.Generator) -> None:
+    """The first one and the last one too: 255 dead codes draw among 20 vectors."""
+    book = ResidualVQ(256, 8, dead_code_threshold=1.0)
+    book.kmeans_init(clusters(600, generator), generator)
+    book.codes[0, 1:] = book.ema_sum[0, 1:] = 1e3
+    book.ema_count[0, 1:] = 0.0
+    vectors, mask = clusters(40, generator), torch.arange(40) % 2 == 1
+    book(vectors, mask, generator)
+    equal = (book.codes[0, 1:, None] == vectors).all(-1)
+    assert equal.any(1).all(), "each is a vector of the batch"
+    assert torch.equal(equal.any(0), mask)
+
+
 @pytest.mark.parametrize(("vectors", "dies"), [(4, False), (16, False), (64, True), (400, True)])
 def test_few_vectors_kill_few_codes(vectors: int, dies: bool, generator: torch.Generator) -> None:
     """A code that was chosen seldom is dead only where a batch has vectors enough to choose it."""
