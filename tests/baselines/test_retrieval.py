@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from magnet.baselines import HoldPose, NearestNeighbour, RandomSample
+from magnet.baselines import HoldPose, NearestNeighbour, RandomSample, Windows
 from magnet.baselines.retrieval import assignments, best_move, misfit
+from magnet.body import load_body
 from magnet.motion.frames import canonical_frame, from_planar, inverse, pairwise, pose_features, to_9d
 from magnet.motion.rotations import from_6d, to_6d
 from magnet.motion.scene import Scene, concatenate
@@ -206,6 +207,18 @@ def test_held_pose_is_the_last_known_frame() -> None:
     for t in range(5):
         assert torch.equal(held.T_world_root[:, t], context.T_world_root[:, -1])
         assert torch.equal(held.body_rot[:, t], context.body_rot[:, -1])
+
+
+def test_windows_of_so_many_people_are_recorded_ones_and_their_mirror_images_or_not(train: Scene) -> None:
+    scenes = train.select(range(25, 35))  # five of one person, five of two
+    windows = Windows.of([scenes], load_body(), CONTEXT, mirror=True)
+    for people in (1, 2):
+        recorded = windows.of_people(people, mirrored=False)
+        assert len(recorded) == 5 and len(windows.of_people(people)) == 10
+        joints = windows.joints_of(recorded, people, torch.arange(CONTEXT))
+        own = load_body().joints(scenes)[5 * people - 5 : 5 * people, :CONTEXT, :people]
+        torch.testing.assert_close(joints.transpose(1, 2), own)
+    assert not len(windows.of_people(3))
 
 
 def test_no_move_fits_better_than_the_best_move() -> None:

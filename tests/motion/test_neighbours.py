@@ -27,6 +27,14 @@ def test_partners_are_the_nearest_within_reach() -> None:
         assert sorted(q for q in table[p].tolist() if q != p) == sorted(near)
 
 
+@pytest.mark.parametrize("people", [1, 2, 3])
+def test_slots_beyond_all_others_point_at_nobody(people: int) -> None:
+    table = nearest_partners(*crowd(people, 0.5))
+    assert table.shape == (people, 3)
+    for p, row in enumerate(table.tolist()):
+        assert sorted(row) == sorted([q for q in range(people) if q != p] + [p] * (4 - people))
+
+
 @pytest.mark.parametrize(("metres", "stays"), [(ENTER + 0.1, True), (LEAVE - 0.1, True), (LEAVE + 0.1, False)])
 def test_a_partner_stays_until_further_away_than_one_enters(metres: float, stays: bool) -> None:
     ground, present, before, bonds = crowd(5, 0.0)

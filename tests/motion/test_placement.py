@@ -20,6 +20,22 @@ def test_every_placement_has_a_function():
     assert tuple(PLACEMENTS) == get_args(Placement)
 
 
+@pytest.mark.parametrize("people", [1, 3])
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_without_others_everybody_goes_its_own_way(placement: Placement, people: int) -> None:
+    """A walk of complex numbers: each step is turned by the heading before it."""
+    generator = torch.Generator().manual_seed(6)
+    yaw, start = torch.randn(2, 9, people, generator=generator), torch.randn(2, people, generator=generator)
+    step, ground = torch.randn(2, 9, people, 2, generator=generator), torch.randn(2, people, 2, generator=generator)
+    alone = torch.zeros(2, 9, 1, 0, 4, 4) if people == 1 else None  # nobody else to be placed by, or nothing is said
+    placed = place(from_planar(yaw, step), alone, from_planar(start, ground), placement)
+    heading, at = start.double(), torch.view_as_complex(ground.double())
+    for t in range(9):
+        at = at + torch.view_as_complex(step[:, t].double()) * torch.polar(torch.ones_like(heading), -heading)
+        heading = heading + yaw[:, t]
+        torch.testing.assert_close(placed[:, t], from_planar(heading, torch.view_as_real(at)).float())
+
+
 def frame_by_frame(
     deltas: Tensor, pairs: Tensor, start: Tensor, weight: float, present: Tensor, fixed: Tensor
 ) -> tuple[Tensor, Tensor]:

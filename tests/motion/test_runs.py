@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 
-from magnet.motion.runs import held, true_runs
+from magnet.motion.runs import filled, held, true_runs
 from magnet.testing import random_scene
 
 
@@ -33,3 +34,10 @@ def test_the_last_good_pose_is_held_and_at_the_beginning_the_first():
         assert torch.equal(made.body_rot[b], scene.body_rot[b, taken])
         assert torch.equal(made.T_world_root[b], scene.T_world_root[b, taken])
     assert held(scene, torch.ones_like(good)) is scene
+
+
+def test_each_persons_bad_frames_are_filled_with_that_persons_own():
+    frames = np.arange(10).reshape(5, 2)  # frame t of person p is 2 t + p
+    valid = np.array([[0, 0], [1, 0], [0, 0], [0, 1], [1, 0]], dtype=bool)
+    assert filled(frames, valid).tolist() == [[2, 7], [2, 7], [2, 7], [2, 7], [8, 7]]
+    assert filled(frames, np.ones((5, 2), dtype=bool)) is frames

@@ -92,6 +92,30 @@ def test_read_literally_self_and_partner_coincide_for_two_people(generator):
     assert not torch.allclose(guided("self", False), guided("partner", False), atol=1e-3)
 
 
+@pytest.mark.parametrize("guide", ["self", "partner"])
+def test_by_default_each_is_read_from_its_own_branch_at_the_papers_weight(given, guide):
+    asked = run(given, kind=guide, paper_average=False, weight=1.0, smooth=0.0)
+    assert torch.equal(run(given, kind=guide), asked)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("kind", "past", "got 'past', expected none or history or self or partner"),
+        ("weight", -1.0, "got -1"),
+        ("smooth", -0.1, "got -0.1"),
+        ("cond_weight", -0.5, "got -0.5"),
+        ("stabilization_level", LEVELS, "got 1000"),
+        ("stabilization_beside", -1, "got -1"),
+        ("stabilization_unseen", 0.5, "got 0.5"),
+        ("stabilization_after", -1, "got -1"),
+    ],
+)
+def test_a_guidance_that_means_nothing_is_refused_by_its_name(option, value, said):
+    with pytest.raises(ValueError, match=f"{option}: {said}"):
+        Guidance(**{option: value})
+
+
 @pytest.mark.parametrize(("guide", "count"), [("none", 1), ("history", 2), ("self", 5), ("partner", 5)])
 def test_all_branches_are_one_batch_and_none_runs_twice(given, guide, count):
     sizes = []

@@ -158,6 +158,8 @@ def test_a_scale_is_that_of_new_noise_alone():
     plain, scaled = (NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0, scale=scale) for scale in (1.0, 1.25))
     assert all(torch.equal(one, other) for one, other in zip(plain.draw(4), scaled.draw(4), strict=True))
     assert torch.equal(scaled.drawn(0, 2, draws), 1.25 * plain.drawn(0, 2, draws))
+    unsaid = NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0)
+    assert torch.equal(unsaid.drawn(0, 2, draws), plain.drawn(0, 2, draws))
     with pytest.raises(ValueError, match="scale: got 0, expected"):
         NoiseStream((1, 1, 1), scale=0.0)
 

@@ -268,6 +268,9 @@ def test_a_grid_of_nothing_names_the_size(size):
 def test_more_context_than_there_is_is_refused():
     with pytest.raises(ValueError, match="context: got 5 token steps, expected at most the 4 there are"):
         Grid(4, 2, 5)
+    for size in ("stride", "turn"):
+        with pytest.raises(ValueError, match=f"{size} must lie between 1 and the window of 4: got 5"):
+            Grid(**{"tokens": 8, "agents": 2, "context": 4, "window": 4, "stride": 4, size: 5})
 
 
 @pytest.mark.parametrize("rolls", [True, False])

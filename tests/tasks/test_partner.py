@@ -104,5 +104,8 @@ def test_targets_must_exist_and_leave_somebody():
         PartnerInpainting(own_past="false").schedule(GRID)
     with pytest.raises(ValueError, match="offset: got 2"):
         AgenticAsync(2).schedule(GRID)
+    for task in (AgenticSync(), AgenticAsync()):
+        with pytest.raises(ValueError, match="continues a recording: give it context frames"):
+            task.schedule(replace(GRID, context=0))
     with pytest.raises(ValueError, match="at most once"):
         AgenticAsync(order=(1, 1)).schedule(GRID)
