@@ -31,6 +31,11 @@ def test_absent_agents_make_no_difference(make: Callable[[], Metric]) -> None:
         assert result(make(), *filled, present) == result(make(), generated, truth, present)
 
 
+def test_everybody_is_present_where_nothing_is_said() -> None:
+    generated, truth, present = draw_batch(people=2)
+    assert result(PositionError(), generated, truth) == result(PositionError(), generated, truth, present)
+
+
 @EVERY
 def test_split_updates_merge_to_one_pass(make: Callable[[], Metric]) -> None:
     batches = [draw_batch(seed=seed, scenes=scenes) for seed, scenes in ((1, 3), (2, 1), (3, 4))]
