@@ -148,7 +148,7 @@ def test_a_live_past_is_faint_for_those_who_are_not_given(generator):
 
 def test_half_of_the_faint_live_pasts_are_faint_from_the_first_token_on(generator):
     """The others are clean for a while, as where what was given comes before what was made."""
-    levels = live_levels(NoiseOptions("mixture", faint_past=0.5), 20_000, 16, 1, generator)[..., 0]
+    levels = live_levels(NoiseOptions("mixture", faint_past=0.5), (20_000, 16, 1), generator)[..., 0]
     faint = (levels > 0) & (levels <= FAINT)
     apart = ((levels > FAINT) & (levels < LEVELS)).any(dim=1)  # the block is not as faint as the past may be
     long = apart & ((levels <= FAINT).sum(dim=1) >= 8)  # so that what begins at random begins within it
