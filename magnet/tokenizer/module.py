@@ -62,6 +62,9 @@ class Tokenizer(TokenizerCore, Trained):
 
         Codes wait for the `continuous_steps` of training that go without them.
         """
+        settled = self.quantizer.initialized or self.quantizer.waits
+        if settled and self.vqvae.pose.ready:
+            return
         some = []
         for number, scene in enumerate(scenes):
             some.append(scene.to(self.device))
@@ -69,7 +72,7 @@ class Tokenizer(TokenizerCore, Trained):
                 break
         if not self.vqvae.pose.ready:
             self.fit_normalizers(some)
-        if self.quantizer.initialized or self.quantizer.waits:
+        if settled:
             return
         vectors: list[Tensor] = []
         for scene in some:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,19 @@ def test_codes_start_after_the_steps_without_them_also_where_training_was_stoppe
     trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(again, datamodule=Scenes(), **resume)
     state = first.state_dict()
     assert all(torch.equal(state[name], value) for name, value in again.state_dict().items())
+
+
+def test_data_are_read_once_for_statistics_and_once_for_codes_that_wait(tmp_path: Path) -> None:
+    class Counted(Scenes):
+        read = 0
+
+        def statistics_batches(self) -> Iterator[Scene]:
+            self.read += 1
+            yield from super().statistics_batches()
+
+    data, quick = Counted(), {"limit_val_batches": 0, "enable_checkpointing": False}
+    trainer(tmp_path, max_steps=4, **quick).fit(tiny(quantizer={"continuous_steps": 100}), datamodule=data)
+    assert data.read == 2
 
 
 def test_what_waits_for_codes_does_not_start_from_another_again(run: tuple[Tokenizer, Path], tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import LightningModule
 from lightning.pytorch.tuner import Tuner
 
 from magnet.denoiser.module import Denoiser
@@ -15,7 +15,7 @@ from magnet.peers import ReMoS
 from magnet.testing import tiny_tokenizer
 from magnet.tokenizer import Tokenizer
 from tests.datamodules.fakes import FakeData, random_clip
-from tests.tokenizer.small import tiny
+from tests.tokenizer.small import tiny, trainer
 
 SMALL = {"width": 24, "layers": 1, "heads": 2, "mlp_ratio": 1}
 
@@ -34,22 +34,13 @@ def test_a_learning_rate_is_found_and_trained_with(kind: type[LightningModule], 
     torch.manual_seed(0)
     model = untrained(kind)
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    trainer = Trainer(
-        max_steps=1,
-        limit_val_batches=0,
-        accelerator="cpu",
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        default_root_dir=tmp_path,
-    )
+    once = trainer(tmp_path, max_steps=1, limit_val_batches=0, enable_checkpointing=False)
     options = {"num_training": 8, "update_attr": False, "early_stop_threshold": None}
-    found = Tuner(trainer).lr_find(model, datamodule=data, **options)
+    found = Tuner(once).lr_find(model, datamodule=data, **options)
     assert found is not None and len(found.results["loss"]) == 8
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     model.learning_rate = 3e-3
-    trainer.fit(model, datamodule=data)
-    assert [group["initial_lr"] for group in trainer.optimizers[0].param_groups] == [3e-3]
+    once.fit(model, datamodule=data)
+    assert [group["initial_lr"] for group in once.optimizers[0].param_groups] == [3e-3]
     assert model.hparams["optimizer"]["learning_rate"] == 3e-3, "a run that goes on knows it"
     assert any(not torch.equal(value, before[name]) for name, value in model.state_dict().items())
