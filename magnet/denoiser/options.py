@@ -209,6 +209,7 @@ class Sampling:
         opening: more denoising steps at the highest noise where nothing in a window is known.
         pairwise_weight: weight of a pairwise transform against a delta.
         settle: how poses are corrected.
+        settle_groups: how those of three and more people from nothing are. None: as `settle`, with `firm` for `hold`.
         smooth_path: whether paths over the floor are smoothed.
         together: metres that couples stay within where scenes go on for long.
         noise_scale: standard deviation of the new noise in each denoising step.
@@ -224,6 +225,7 @@ class Sampling:
     opening: int | None = None
     pairwise_weight: float | None = None
     settle: Settling | None = None
+    settle_groups: Settling | None = None
     smooth_path: bool | None = None
     together: float | None = None
     noise_scale: float | None = None
@@ -234,3 +236,7 @@ class Sampling:
 
     def __post_init__(self) -> None:
         SamplerOptions().filled(self)  # which refuses what no sampler takes
+        if self.settle_groups is not None:
+            require_choice("settle_groups", self.settle_groups, Settling)
+            if self.settle in (None, "off"):
+                raise ValueError(f"settle_groups: got {self.settle_groups!r}, but nobody is corrected; give settle too")

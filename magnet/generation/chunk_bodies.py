@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from magnet.denoiser.options import Sampling
 from magnet.generation.blending import crossfade_given, freeze_after, smoothed_path
 from magnet.generation.causal_bodies import World, decoded_frames
 from magnet.generation.conditioning import receptive_field, require_finite
@@ -47,17 +48,19 @@ def chunk_bodies(world: World, tokens: Tensor, first: int, stop: int, before: Sc
     return freeze_after(made, world.rows_by_frame(placed), before)
 
 
-def settle_of_groups(said: SamplerOptions | None, filled: SamplerOptions, known: Tensor) -> Settling | None:
+def settle_of_groups(said: SamplerOptions | None, best: Sampling, known: Tensor) -> Settling | None:
     """How scenes of three and more people are corrected; None: as couples are.
 
     Couples hold hands; three and more from nothing walk in circles, clap and part.
 
     Args:
-        said: options before they were `filled` with those that are best for the model.
+        said: options before they are filled with what is best for the model.
+        best: what is best for the model.
         known: (N, P) bool, which tokens are given.
     """
-    unsaid = said is None or said.settle is None
-    return "firm" if unsaid and filled.settle == "hold" and not bool(known.any()) else None
+    if (said is not None and said.settle is not None) or bool(known.any()):
+        return None
+    return best.settle_groups or ("firm" if best.settle == "hold" else None)
 
 
 def corrected_alike(world: World, scene: Scene, fixed: Tensor) -> Scene:

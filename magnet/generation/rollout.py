@@ -218,7 +218,7 @@ class Rollout:
         self.there: float = self.length
         self.expected = Expected(receptive_field(model)[1])
         self._clean = torch.empty(0)  # what the network said last, of tokens ahead of the window too
-        groups = settle_of_groups(options, o, self.known)
+        groups = settle_of_groups(options, model.sampling, self.known)
         self.world = WorldState(model, self._given(0, 0), schedule, o, samples, stats, groups)
         self.tokens, self.mask_noise = self.noise.draw(0)
         self.history = None if o.solver == "ddim" else History.empty(self.tokens)

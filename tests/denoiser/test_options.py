@@ -191,6 +191,15 @@ def test_how_it_is_best_sampled_comes_back_with_a_checkpoint(tmp_path):
     assert tiny_denoiser().sampling == Sampling() and Denoiser.load("duet").sampling.settle == "hold"
 
 
+def test_groups_are_corrected_otherwise_only_where_couples_are_corrected():
+    assert Sampling(settle="hold", settle_groups="light").settle_groups == "light"
+    for wrong in ({"settle_groups": "firm"}, {"settle": "off", "settle_groups": "firm"}):
+        with pytest.raises(ValueError, match="nobody is corrected; give settle too"):
+            Sampling(**wrong)
+    with pytest.raises(ValueError, match="settle_groups: got 'hard'"):
+        Sampling(settle="hold", settle_groups="hard")
+
+
 def test_a_stream_hands_out_what_is_final_at_once_unless_it_is_to_be_corrected(scene: Scene):
     model = tiny_denoiser(sampling={"settle": "firm"})
 

@@ -250,6 +250,9 @@ def test_groups_from_nothing_hold_hands_only_where_that_is_asked_for(model, monk
     assert set(asked) == {("hold", 3)}
     made(scene, "joint_future", [0, 1, 2])
     assert set(asked) == {("hold", 3)}
+    monkeypatch.setattr(model, "sampling", replace(model.sampling, settle_groups="light"))
+    made(scene, "generation", [0, 1, 2])
+    assert set(asked) == {("light", 2), ("hold", 1)}, "as the model says"
 
 
 def test_whoever_is_not_seen_any_further_is_expected_to_go_on() -> None:
