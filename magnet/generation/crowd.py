@@ -18,6 +18,7 @@ from magnet.denoiser.core import DenoiserCore
 from magnet.generation.crowd_room import SMOOTHED, room_made
 from magnet.generation.crowd_settling import SettledGroups, bonded_groups, settled_groups, settled_moments
 from magnet.generation.crowd_start import START, require_crowd, start_from_nothing
+from magnet.generation.crowd_views import PAIR, Window, by_view, gathered, read_from_views, shown_to_views
 from magnet.generation.inputs import check_condition
 from magnet.generation.loaded import Loaded, denoiser_of
 from magnet.generation.rollout import CHUNK, Generators, Rollout
@@ -28,7 +29,7 @@ from magnet.motion.neighbours import CrowdLayout, CrowdViews, nearest_partners
 from magnet.motion.placement import place
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token
-from magnet.sampling.noise import LEVELS, add_noise, alpha_bar
+from magnet.sampling.noise import add_noise
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage, initial_levels
 from magnet.tasks.base import Task
@@ -45,8 +46,6 @@ BEHIND = 8
 
 MOST_HIDING = 16
 """People up to whom a task may hide agents from each other: everybody's view of everybody is their square."""
-
-PAIR = 9 * TOKEN_FRAMES
 
 
 def generate_crowd(
@@ -304,14 +303,19 @@ class CrowdRollout(Rollout):
         """As `Denoiser.denoise`, in views. noisy (R, W, P, D) -> (R, W, P, D)"""
         R, V = len(noisy), len(self.views.people)
         self.stats.windows += R * (V - 1)
-        shown, each = self._shown(noisy, levels)
+        latent = self.viewer.layout.latent
+        if self.crowd:
+            shown, each = shown_to_views(self._window(noisy.shape[1]), noisy, levels)
+        else:
+            own, about, each = gathered(self.views, latent, noisy, levels)
+            shown, each = by_view(torch.cat([own, about.flatten(-2)], dim=-1)), by_view(each)
         there = self.views.present.expand(R, -1, -1).flatten(0, 1)
         cond = None if cond is None else cond.repeat_interleave(V, dim=0)
         made = torch.empty_like(shown)
         for some in self._batches(each, there):
             extra = None if cond is None else cond[some]
             made[some] = self.viewer.denoise(shown[some], each[some], there[some], extra, network).to(made)
-        clean = self._read(made.float().unflatten(0, (R, V)))
+        clean = read_from_views(self.views, latent, made.float().unflatten(0, (R, V)))
         if self.crowd:
             self._guess, self._guess_at = clean[0].detach(), self.begins
         return clean
@@ -327,72 +331,11 @@ class CrowdRollout(Rollout):
         kind = torch.cat([levels.flatten(1), present], dim=1).unique(dim=0, return_inverse=True)[1]
         return [some for number in kind.unique().tolist() for some in order[kind == number].split(BATCH)]
 
-    def _shown(self, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
-        """What each view shows: tokens (R V, W, M, D) and their levels (R V, W, M)."""
-        views, own = self.views, self.viewer.layout.latent + PAIR
-        pairs = noisy[..., own:].unflatten(-1, (-1, PAIR))
-        about = pairs[:, :, views.people[..., None], views.pair.clamp_min(0)]  # (R, W, V, M, K, 36)
-        free = ~self.views.present
-        if self.crowd:
-            self._work_out(about, noisy, levels)
-            each = torch.where(free, LEVELS, levels[:, :, views.people])
-        else:
-            each = levels[:, :, views.people]
-        shown = torch.cat([noisy[:, :, views.people, :own], about.flatten(-2)], dim=-1)
-        return shown.transpose(1, 2).flatten(0, 1), each.transpose(1, 2).flatten(0, 1)
-
-    def _work_out(self, about: Tensor, noisy: Tensor, levels: Tensor) -> None:
-        """Fill in pairwise transforms of two people of a view who are no partners. about (R, W, V, M, K, 36)
-
-        The view's ego holds pairwise transforms to both: from their expected values, with the noise of one of them.
-        Two who are known stand where they are placed, whatever an ego who is not known expects.
-        """
-        views, device = self.views, noisy.device
-        other = self.viewer.layout.partners(device)  # (M, K)
-        lacking = (views.pair < 0) & views.present[..., None] & views.present[:, other]
-        v, a, s = lacking.nonzero(as_tuple=True)
-        if not len(v):
-            return
-        ego, one, two = views.ego[v], views.people[v, a], views.people[v, other[a, s]]
-        (T_ego_one, *first), (T_ego_two, *second) = (self._seen_by(ego, who, noisy, levels) for who in (one, two))
-        level = torch.maximum(levels[:, :, one], levels[:, :, two])
-        T_world_can = self.world.T_world_can[0].unflatten(0, (-1, TOKEN_FRAMES)).transpose(1, 2)  # (n, P, 4, 4, 4)
-        row = torch.arange(levels.shape[1], device=device) + self.begins - self.first
-        T_world_can = T_world_can[row.clamp(max=len(T_world_can) - 1)]  # what lies ahead is nobody's
-        placed = inverse(T_world_can[:, one]) @ T_world_can[:, two]
-        T_one_two = torch.where((level == 0)[..., None, None, None], placed, inverse(T_ego_one) @ T_ego_two)
-        mean, std = self._pair_statistics()
-        clean = (to_9d(T_one_two).flatten(-2) - mean) / std  # (R, W, E, 36)
-        noise = torch.where((second[1] >= first[1])[..., None], second[0], first[0])
-        about[:, :, v, a, s] = add_noise(clean, noise, level[..., None])
-
-    def _seen_by(self, ego: Tensor, who: Tensor, noisy: Tensor, levels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """How people stand as an ego expects it, and the noise and the level of what the ego's token says of that.
-
-        ego, who (E,) int -> T_ego_who (R, W, E, 4, 4), noise (R, W, E, 36), level (R, W, E); -1: of the ego itself
-        """
-        slot = (self.model.layout.partners(ego.device)[ego] == who[:, None]).int().argmax(dim=1)
-        numbers = self.viewer.layout.latent + PAIR * (1 + slot[:, None]) + torch.arange(PAIR, device=ego.device)
-        said, level = noisy[:, :, ego[:, None], numbers], torch.maximum(levels[:, :, ego], levels[:, :, who])
-        guess = self._guessed(self.begins, noisy.shape[1])[:, ego[:, None], numbers]
-        clean = torch.where(level[..., None] == 0, said, guess)
-        share = alpha_bar(level)[..., None]
-        noise = (said - share.sqrt() * clean) / (1 - share).clamp_min(1e-6).sqrt()
-        mean, std = self._pair_statistics()
-        T_ego_who = from_9d((clean * std + mean).unflatten(-1, (TOKEN_FRAMES, 9)))
-        itself = (who == ego)[:, None, None, None]
-        return (
-            torch.where(itself, torch.eye(4, dtype=T_ego_who.dtype, device=ego.device), T_ego_who),
-            noise,
-            torch.where(who == ego, -1, level),
-        )
-
-    def _read(self, clean: Tensor) -> Tensor:
-        """Everybody from the own view. (R, V, W, M, D) -> (R, W, P, D)"""
-        views, own = self.views, self.viewer.layout.latent + PAIR
-        mine = clean[:, views.view, :, views.slot]  # (P, R, W, D)
-        pairs = mine[..., own:].unflatten(-1, (-1, PAIR))
-        person = torch.arange(len(mine), device=clean.device)[:, None]
-        about = pairs[person, :, :, views.partner_slot.clamp_min(0)]  # (P, K, R, W, 36)
-        read = torch.cat([mine[..., :own], about.permute(0, 2, 3, 1, 4).flatten(-2)], dim=-1)
-        return read.permute(1, 2, 0, 3)
+    def _window(self, rows: int) -> Window:
+        """What is known in the rows that the network is asked about."""
+        device, table = self.viewer.device, self.model.layout.partners(self.viewer.device)
+        T_world_can = self.world.T_world_can[0].unflatten(0, (-1, TOKEN_FRAMES))
+        row = torch.arange(rows, device=device) + self.begins - self.first
+        placed = T_world_can[row.clamp(max=len(T_world_can) - 1)]  # what lies ahead is nobody's
+        guess, (mean, std) = self._guessed(self.begins, rows), self._pair_statistics()
+        return Window(self.views, table, self.viewer.layout.latent, mean, std, guess, placed)
