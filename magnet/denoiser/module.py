@@ -177,6 +177,7 @@ class Denoiser(DenoiserCore, TokenModel):
             self.require_statistics()
         layout, weight = self.layout, self.loss
         with torch.no_grad():
+            scene = scene.absent_at_origin()  # NaN there would be in every gradient
             tokens, there = self.tokenize(scene)
             named = scene.pad_agents(layout.agents)
             scene = named.replace(names=())  # by which a GPU would be waited for

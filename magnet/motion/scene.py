@@ -212,6 +212,12 @@ class Scene:
         given = None if self.given is None else torch.nn.functional.pad(self.given, (0, extra))
         return self.replace(**{**cat_agents([self, empty]).tensors(), "given": given})
 
+    def absent_at_origin(self) -> Self:
+        """The same people; slots in which nobody is stand at the origin, whatever was there."""
+        nowhere = torch.eye(4, dtype=self.T_world_root.dtype, device=self.T_world_root.device)
+        there = self.present[:, None, :, None, None]
+        return self.replace(T_world_root=torch.where(there, self.T_world_root, nowhere))
+
     def transformed(self, T_new_world: Tensor) -> Self:
         """The same motion seen from another world frame. T_new_world: (4, 4) or (B, 1, 1, 4, 4)"""
         keep = self.present[:, None, :, None, None]

@@ -324,6 +324,15 @@ def test_absent_agents_cost_nothing(generator):
     moved = scene.replace(T_world_root=scene.T_world_root.clone())
     moved.T_world_root[:, :, 2, :3, 3] += 5.0
     assert torch.equal(loss(scene), loss(moved))
+    gradients = []
+    for filler in (0.0, torch.nan):
+        filled = scene.replace(**{name: each.clone() for name, each in scene.tensors().items()})
+        for each in (filled.T_world_root[:, :, 2], filled.body_rot[:, :, 2], filled.betas[:, 2]):
+            each.fill_(filler)
+        weights = list(model.transformer.parameters())
+        gradients.append(torch.autograd.grad(loss(filled), weights, materialize_grads=True))
+    assert all(each.isfinite().all() for each in gradients[1])
+    assert all(torch.equal(*each) for each in zip(*gradients, strict=True))
 
 
 def test_a_model_that_could_not_be_sampled_is_not_trained(tmp_path) -> None:
