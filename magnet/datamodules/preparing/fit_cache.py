@@ -139,9 +139,19 @@ class FitCache:
         return self.folder / f"{take.name}.{self.keys[take.name]}.npz"
 
     def report(self, take: Take) -> dict[str, Any]:
-        """The report on a take with these very files, or an "error"; empty while it has not been fitted."""
+        """The report on a take with these very files, or an "error"; empty while it has not been fitted.
+
+        Raises:
+            ValueError: its file is damaged.
+        """
         report = self.file(take).with_suffix(".json")
-        return json.loads(report.read_text(encoding="utf-8")) if report.exists() else {}
+        if not report.exists():
+            return {}
+        try:
+            return dict(json.loads(report.read_text(encoding="utf-8")))
+        except ValueError as error:
+            advice = "delete it and the .npz beside it, and the take is fitted again"
+            raise ValueError(f"{report} is damaged ({error}): {advice}") from error
 
     def scene(self, take: Take) -> Scene | None:
         """The fitted take; None: it could not be used, or has not been fitted."""
