@@ -98,22 +98,22 @@ def key_positions(known: Tensor, grid: Grid) -> Iterator[tuple[int, int, int]]:
     generated at once. A longer gap is generated stride by stride, and the rest at once when its end comes into view.
     """
     N, W = len(known), grid.window
+    sight = W - min(grid.stride, W // 2)  # token steps ahead, so that some past stays in view
     coming = next_keys(known)
     done = 0
     while not bool(known[done:].all()):
         first = done + int((~known[done:]).any(dim=1).int().argmax())
-        sight = W - min(first, grid.stride, W // 2)  # token steps ahead, so that some past stays in view
         ahead = coming[first][~known[first]]
         reached = ahead[(ahead < N) & (ahead - first < sight)]
         stop = int(reached.max()) + 1 if len(reached) else first + min(grid.stride, sight)
         start = max(0, min(stop - W, N - W))
         stop = min(start + W, N)
-        # Whoever will see the next keyframe from a later window waits, and the others with them.
+        # Whoever will see the next keyframe from a later window waits, and the others with them. At `first` nobody
+        # does: a keyframe that near is in this window.
         step = torch.arange(first, stop)[:, None]
-        waits = ~known[first:stop] & (coming[first:stop] >= stop) & (coming[first:stop] < N)
-        waits &= coming[first:stop] - step < W - min(grid.stride, W // 2)
+        waits = (coming[first:stop] >= stop) & (coming[first:stop] < N)
+        waits &= coming[first:stop] - step < sight
         waiting = waits.any(dim=1)
-        waiting[0] = False
         done = first + int(waiting.int().argmax()) if bool(waiting.any()) else stop
         yield start, first, done
 

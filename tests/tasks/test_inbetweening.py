@@ -17,7 +17,7 @@ from magnet.motion.tokens import by_frame, pairwise_by_frame
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.sampler import sample
 from magnet.sampling.schedule import Grid
-from magnet.tasks.inbetweening import Inbetweening
+from magnet.tasks.inbetweening import Inbetweening, key_positions, next_keys
 from magnet.tasks.partner import PartnerInpainting
 from magnet.testing import random_scene, tiny_denoiser
 from tests.cases import few
@@ -66,6 +66,8 @@ def settled(model, scene, task, options, tokens: int, context: int = 2):
         (Inbetweening(pairs=((0, 4), (1, 9))), {0: {4}, 1: {9}}),
         (Inbetweening(keys=(7,), agents=(0,), pairs=((1, 9),)), {0: {7}, 1: {9}}),
         (Inbetweening(pairs=[[0, 4], [1, 9]]), {0: {4}, 1: {9}}),
+        (Inbetweening(keys=(-14,)), {0: {2}, 1: {2}}),
+        (Inbetweening(), {0: {9, 15}, 1: {9, 15}}),
     ],
 )
 def test_keyframes_are_where_they_were_asked_for(task, keys):
@@ -73,6 +75,12 @@ def test_keyframes_are_where_they_were_asked_for(task, keys):
     for agent, steps in keys.items():
         assert set(schedule.known[:, agent].nonzero()[:, 0].tolist()) == {0, 1} | steps
     assert schedule.finished.all()
+
+
+def test_without_a_past_keyframes_are_counted_from_the_first_token_step():
+    known = Inbetweening(keys=(-16, 7)).schedule(Grid(16, 2, 0, 3)).known
+    assert known[:, 0].nonzero()[:, 0].tolist() == [0, 7]
+    assert Inbetweening().schedule(Grid(20, 1, 0, 3)).known[:, 0].nonzero()[:, 0].tolist() == [0, 8, 16, 19]
 
 
 @pytest.mark.parametrize(("window", "stride"), [(4, 2), (8, 2), (16, 2), (16, 4), (16, 12)])
@@ -90,10 +98,55 @@ def test_whatever_can_be_is_generated_in_sight_of_the_next_keyframe(task, window
         assert first >= min(stage.start + first, stride, window // 2)  # some past is in view, where there is so much
 
 
+def test_named_keyframes_are_those_that_are_known():
+    task = Inbetweening(keys=(7, -1), agents=(0,), pairs=((1, 9), (1, -3)))
+    known = task.schedule(Grid(16, 2, 0, 3)).known
+    assert task.named(16) == known.any(dim=1).nonzero()[:, 0].tolist() == [7, 9, 13, 15]
+
+
+def check_position(known: Tensor, grid: Grid, start: int, first: int, done: int) -> None:
+    """One position of the window, of keyframes (N, P) bool: what is documented of `key_positions`."""
+    N, W = len(known), grid.window
+    stop, most = start + min(W, N), min(grid.stride, W // 2)
+    keys = next_keys(known)
+    assert 0 <= start <= first < done <= stop <= N and not known[first].all()
+    assert first - start >= min(first, most), "some past is in view, where there is so much"
+    seen = keys[first][~known[first]]
+    seen = seen[(seen < N) & (seen - first < W - min(first, most))]
+    assert (seen < stop).all(), "a keyframe that fits into the window after its gap is in it"
+    if not len(seen):
+        assert done <= max(first + grid.stride, W), "with none in sight it goes on stride by stride"
+    if done < stop:  # somebody is left to a later window, who will see their keyframe from there
+        later = keys[done][~known[done]]
+        assert ((later >= stop) & (later < N) & (later - done < W - most)).any()
+
+
+def test_windows_go_to_the_keyframes_in_sight_and_by_strides_where_there_are_none(generator):
+    """Of everybody at once and of each at other times, with a past and without."""
+    for trial in range(150):
+        N, P, W, stride, context = (
+            int(torch.randint(low, high, (), generator=generator))
+            for low, high in ((1, 40), (1, 4), (1, 17), (1, 17), (0, 6))
+        )
+        grid = Grid(N, P, min(context, N), 2, W, min(stride, W))
+        scarce = torch.rand((), generator=generator) * 0.3
+        known = grid.past() | (torch.rand(N, P if trial % 2 else 1, generator=generator) < scarce)
+        after = 0
+        for start, first, done in key_positions(known, grid):
+            assert first == after + int((~known[after:]).any(dim=1).int().argmax()), "nothing is left out"
+            check_position(known, grid, start, first, done)
+            after = done
+        assert known[after:].all()
+
+
 def test_bad_keyframes_are_named():
     grid = Grid(16, 2, 2)
     for task, message in [
         (Inbetweening(keys=(16,)), "token step 16: the grid has steps 0 to 15"),
+        (Inbetweening(keys=(-17,)), "token step -17: the grid has steps 0 to 15"),
+        (Inbetweening(pairs=((-1, 4),)), "agent -1: the grid has agents 0 to 1"),
+        (Inbetweening(pairs=((0, 4, 9),)), r"pairs: got \(0, 4, 9\), expected an agent's slot and a token step"),
+        (Inbetweening(pairs=4), r"pairs: got 4, expected whole numbers in brackets"),
         (Inbetweening(keys=(3,), agents=(2,)), "agent 2: the grid has agents 0 to 1"),
         (Inbetweening(agents=(1,), pairs=((0, 4),)), "leave agents out, or name keys"),
         (Inbetweening(every=0), "at least 1"),

@@ -52,7 +52,12 @@ def test_agents_in_step_do_not_see_each_others_current_tokens():
             assert torch.equal(hidden, current & (torch.arange(3) != agent))
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, 1.0])
+def test_agents_in_step_plan_a_block_at_a_time():
+    stages = AgenticSync(block=2).schedule(replace(GRID, tokens=12)).stages
+    assert [stage.active for stage in stages] == [(8, 10), (10, 12)]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.27, 0.3, 0.5, 1.0])
 def test_turns_start_the_offset_apart(offset):
     grid = Grid(tokens=12, agents=3, context=8, steps=10)
     rows = torch.stack(list(AgenticAsync(offset, order=(2, 0)).schedule(grid).levels_by_step()))[:, 8:]
@@ -81,6 +86,13 @@ def test_at_the_full_offset_turns_are_stages():
     assert who == 4 * [[2], [0], [1]]
 
 
+@pytest.mark.parametrize(("order", "turns"), [((), (0, 1, 2, 3)), ((2,), (2, 0, 1, 3)), ((3, 1), (3, 1, 0, 2))])
+def test_whoever_the_order_leaves_out_follows_in_their_own_each_after_the_one_before(order, turns):
+    stages = AgenticAsync(order=order).schedule(Grid(tokens=9, agents=4, context=8, steps=2)).stages
+    who = [(stage.levels[0] != stage.levels[-1]).any(dim=0).nonzero()[:, 0].tolist() for stage in stages]
+    assert who == [[agent] for agent in turns]
+
+
 def test_a_turn_is_as_long_as_the_model_is_best_sampled_where_the_task_does_not_say():
     grid = Grid(tokens=12, agents=2, context=8, steps=4)
     assert len(AgenticAsync().schedule(grid).stages) == 2 * 4
@@ -91,11 +103,23 @@ def test_a_turn_is_as_long_as_the_model_is_best_sampled_where_the_task_does_not_
         replace(grid, turn=0)
 
 
+@pytest.mark.parametrize("task", [PartnerInpainting, PartnerPrediction, MotionControl])
+def test_the_first_agent_is_generated_where_nothing_is_said(task):
+    plan = task().schedule(GRID)
+    assert (plan.finished & ~plan.known).any(dim=0).tolist() == [True, False, False]
+
+
 def test_targets_must_exist_and_leave_somebody():
     with pytest.raises(ValueError, match=r"target \(1, 1\): name each agent once"):
         PartnerInpainting(target=(1, 1)).schedule(Grid(4, 3, 0))
     with pytest.raises(ValueError, match="target 5: the grid has agents 0 to 2"):
         PartnerInpainting((5,)).schedule(GRID)
+    with pytest.raises(ValueError, match="target -1: the grid has agents 0 to 2"):
+        PartnerInpainting((-1,)).schedule(GRID)
+    with pytest.raises(ValueError, match=r"target: got .*0\.5"):
+        PartnerInpainting((0.5,)).schedule(GRID)
+    with pytest.raises(ValueError, match=r"target \(\): name some of the 3 agents, not none and not all"):
+        PartnerInpainting(()).schedule(GRID)
     with pytest.raises(ValueError, match="not none and not all"):
         PartnerInpainting((0, 1, 2)).schedule(GRID)
     with pytest.raises(ValueError, match="--people 2` adds another"):
@@ -109,3 +133,7 @@ def test_targets_must_exist_and_leave_somebody():
             task.schedule(replace(GRID, context=0))
     with pytest.raises(ValueError, match="at most once"):
         AgenticAsync(order=(1, 1)).schedule(GRID)
+    with pytest.raises(ValueError, match=r"order \(0, 3\): name each of the agents 0 to 2"):
+        AgenticAsync(order=(0, 3)).schedule(GRID)
+    with pytest.raises(ValueError, match=r"order: got .*0\.5"):
+        AgenticAsync(order=(0.5,)).schedule(GRID)

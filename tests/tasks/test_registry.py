@@ -93,9 +93,10 @@ def test_a_plug_in_that_fails_is_listed_and_hides_no_other(clean_registry, monke
 
 
 def test_a_variable_names_an_uninstalled_task(clean_registry, monkeypatch):
-    monkeypatch.setenv(registry.VARIABLE, f"{__name__}:Foreign")
+    monkeypatch.setenv(registry.VARIABLE, f" {__name__}:Foreign ,")
     registry.discover(again=True)
     assert registry.get("foreign") is Foreign
+    assert not registry.failures()
 
 
 def test_a_taken_name_is_refused(clean_registry):
@@ -106,6 +107,10 @@ def test_a_taken_name_is_refused(clean_registry):
 def test_what_is_no_task_is_refused(clean_registry):
     with pytest.raises(TypeError, match="is not a dataclass"):
         registry.register_task("no")(type("No", (), {"schedule": 1, "formula": ""}))
+    with pytest.raises(TypeError, match=r"has no schedule and no formula; see docs/tasks\.md"):
+        registry.register_task("no")(dataclasses.make_dataclass("No", []))
+    with pytest.raises(TypeError, match=r"has no formula; see docs/tasks\.md"):
+        registry.register_task("no")(dataclasses.make_dataclass("No", [], namespace={"schedule": Foreign.schedule}))
 
 
 @pytest.mark.parametrize(
@@ -132,6 +137,25 @@ def test_a_variable_may_name_a_module_whose_tasks_register_themselves(clean_regi
     assert {entry.name: entry.origin for entry in registry.entries()}["stray"] == "MAGNET_TASKS=stray_tasks"
     lost = {each.name: str(each.error) for each in registry.failures()}
     assert all("registers no task" in lost[name] for name in ("no_tasks", "stray_task"))
+
+
+def test_a_variables_module_has_its_origin_on_all_that_came_with_it_imported_before_or_not(
+    clean_registry, monkeypatch, tmp_path
+):
+    text = "from magnet.tasks import register_task\nfrom magnet.tasks.joint import JointFuture\n"
+    (tmp_path / "part_tasks.py").write_text(f"{text}@register_task('part')\nclass Part(JointFuture):\n    pass\n")
+    (tmp_path / "all_tasks.py").write_text(
+        f"import part_tasks\n{text}@register_task('whole')\nclass Whole(JointFuture):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(registry.VARIABLE, "all_tasks")
+    registry.discover(again=True)
+    origins = {entry.name: entry.origin for entry in registry.entries()}
+    assert origins["whole"] == origins["part"] == "MAGNET_TASKS=all_tasks"
+    registry.TASKS.add("whole", registry.get("whole"), "magnet")  # as an import before leaves it
+    registry.discover(again=True)
+    assert {entry.name: entry.origin for entry in registry.entries()}["whole"] == "MAGNET_TASKS=all_tasks"
+    assert not registry.failures()
 
 
 def test_a_variable_finds_a_module_in_the_working_directory(tmp_path):
