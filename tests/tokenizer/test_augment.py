@@ -49,6 +49,27 @@ def test_limbs_come_only_from_frames_that_are_valid(people, generator):
     assert not torch.equal(mixed.body_rot[0], people.body_rot[0]), "who is short takes from anybody"
 
 
+def donors(mixed, people) -> set[int]:
+    """Whose limbs other people have, by their number among `people` (M, T, 21, 3, 3)."""
+    return {
+        who
+        for taker, own in enumerate(mixed)
+        for joints in limbs()
+        for who, other in enumerate(people)
+        if who != taker and torch.equal(own[:, joints], other[:, joints])
+    }
+
+
+@pytest.mark.parametrize("frames", [16, 8])
+def test_everybody_gives_limbs_to_others_two_people_alone_and_whose_frames_end_as_early(frames, generator):
+    valid = torch.arange(16).expand(2, 16) < frames
+    for there in ([[True, False], [False, True]], [[True, True], [True, True]]):
+        batch = random_scene(2, 16, 2, generator, torch.tensor(there)).replace(valid=valid)
+        own = batch.people().body_rot[:, :, 0]
+        found = [donors(swap_limbs(batch, 1.0, generator).people().body_rot[:, :, 0], own) for _ in range(10)]
+        assert set().union(*found) == set(range(len(own)))
+
+
 def limbs() -> list[torch.Tensor]:
     return [torch.tensor(limb) - 1 for limb in LIMBS.values()]
 
@@ -65,6 +86,31 @@ def test_joints_turn_by_the_same_in_all_frames_and_by_as_much_as_asked(people, g
     assert angle.square().mean().sqrt() == pytest.approx(0.1 * 3**0.5, rel=0.1)
     relative = many.body_rot.transpose(-1, -2) @ turned.body_rot
     assert torch.allclose(relative[:, 0], relative[:, -1], atol=1e-5)
+
+
+def test_each_joint_of_each_person_turns_by_a_rotation_of_its_own(generator):
+    scene = random_scene(3, 4, 2, generator)
+    turned = joint_noise(scene, 0.1, generator)
+    turns = (scene.body_rot.mT @ turned.body_rot)[:, 0]  # (B, P, 21, 3, 3)
+    flat = turns.flatten(0, 2).flatten(1)
+    apart = torch.cdist(flat, flat) + torch.eye(len(flat))
+    assert float(apart.min()) > 1e-4
+
+
+def test_the_pelvis_stays_where_it_is_and_turns_by_a_third(generator):
+    many = random_scene(40, 4, 3, generator)
+    turned = joint_noise(many, 0.3, generator)
+    assert torch.equal(turned.T_world_root[..., :3, 3], many.T_world_root[..., :3, 3])
+    angle = geodesic(many.T_world_root[..., :3, :3], turned.T_world_root[..., :3, :3])
+    assert angle.square().mean().sqrt() == pytest.approx(0.1 * 3**0.5, rel=0.1)
+
+
+def test_people_drift_each_for_themselves_some_more_than_others(generator):
+    deltas = torch.zeros(600, 64, 2, 9)
+    way = root_noise(deltas, 0.3, generator)[..., [6, 8]]  # (B, T, P, 2)
+    for one, other in ((way[:, 32, 0], way[:, 32, 1]), (way[..., 0].std(dim=1)[:, 0], way[..., 0].std(dim=1)[:, 1])):
+        assert abs(float(torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1])) < 0.15
+    assert not deltas.any(), "what is given stays as it is"
 
 
 def test_drift_is_slow_and_smooth_and_over_the_ground_alone(generator):

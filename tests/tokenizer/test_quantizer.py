@@ -105,6 +105,22 @@ def test_few_vectors_kill_few_codes(vectors: int, dies: bool, generator: torch.G
     assert bool((book.codes[0, 3] != 1e3).any()) == dies
 
 
+@pytest.mark.parametrize(("vectors", "least"), [(16, 0.25), (32, 0.5), (64, 1.0), (400, 1.0)])
+def test_a_code_dies_below_one_vector_a_batch_and_below_less_in_batches_of_fewer_than_four_a_code(
+    vectors: int, least: float, generator: torch.Generator
+) -> None:
+    """And comes back with just enough weight to stay where the coming batches choose it."""
+    book = ResidualVQ(16, 8, ema_decay=0.9, dead_code_threshold=1.0)
+    book.kmeans_init(clusters(300, generator), generator)
+    counts = torch.tensor([0.98, 1.02]) * least / 0.9  # before they are lowered by this batch
+    book.codes[0, 3:5] = 1e3
+    book.ema_count[0, 3:5], book.ema_sum[0, 3:5] = counts, 1e3 * counts[:, None]
+    book(clusters(vectors, generator), generator=generator)
+    assert (book.codes[0, 3:5] == 1e3).all(-1).tolist() == [False, True]
+    assert book.ema_count[0, 3] == least
+    torch.testing.assert_close(book.ema_sum[0, 3], least * book.codes[0, 3])
+
+
 def test_without_revival_an_unused_code_does_not_move(generator: torch.Generator) -> None:
     book = ResidualVQ(16, 8, dead_code_threshold=0.0)
     book.kmeans_init(clusters(300, generator), generator)
@@ -113,6 +129,48 @@ def test_without_revival_an_unused_code_does_not_move(generator: torch.Generator
     for _ in range(3):
         book(clusters(200, generator), generator=generator)
     assert (book.codes[0, 3] == 1e3).all()
+
+
+def test_a_code_that_nobody_chose_stays_where_it_is_to_the_bit(generator: torch.Generator) -> None:
+    """A sum over a count, each times the decay, is nearly that."""
+    book = ResidualVQ(64, 8, dead_code_threshold=0.0)
+    book.kmeans_init(clusters(300, generator), generator)
+    book.codes[0, 32:] = book.ema_sum[0, 32:] = 1e3 + torch.randn(32, 8, generator=generator)
+    before = book.codes.clone()
+    for _ in range(3):
+        book(clusters(200, generator), generator=generator)
+    assert torch.equal(book.codes[0, 32:], before[0, 32:])
+
+
+@pytest.mark.parametrize("books", [1, 3])
+def test_commitment_is_the_mean_square_over_kept_vectors_and_codebooks(books: int, generator: torch.Generator) -> None:
+    quantizer = ResidualVQ(16, 8, books).eval()
+    quantizer.codes.normal_(generator=generator)
+    vectors, mask = torch.randn(40, 8, generator=generator), torch.arange(40) % 3 == 0
+    residual, errors = vectors[mask].double(), []
+    for codes in quantizer.codes.double():
+        residual = residual - codes[torch.cdist(residual, codes).argmin(-1)]
+        errors.append(residual.square().mean())
+    found = quantizer(vectors, mask).commitment
+    torch.testing.assert_close(found.double(), torch.stack(errors).mean(), rtol=1e-5, atol=0)
+
+
+def test_codebooks_start_each_from_what_those_before_it_leave(generator: torch.Generator) -> None:
+    vectors = clusters(2000, generator)
+    errors = []
+    for books in (1, 2, 3):
+        quantizer = ResidualVQ(16, 8, books)
+        quantizer.kmeans_init(vectors, torch.Generator().manual_seed(0))
+        errors.append(float((quantizer.nearest(vectors) - vectors).norm(dim=-1).mean()))
+    assert errors[1] < 0.5 * errors[0] and errors[2] < 0.9 * errors[1]
+
+
+def test_codes_that_start_from_fewer_vectors_are_those_vectors_all_of_them(generator: torch.Generator) -> None:
+    vectors = torch.randn(3, 8, generator=generator)
+    book = ResidualVQ(8, 8)
+    book.kmeans_init(vectors, generator)
+    equal = torch.cdist(book.codes[0], vectors) < 1e-5
+    assert equal.any(0).all() and equal.any(1).all()
 
 
 @pytest.mark.parametrize("levels", [1, 3])
@@ -243,17 +301,22 @@ def _rank(rank: int, world: int, folder: str) -> None:
     book = ResidualVQ(16, 8, num_quantizers=2)  # made before the process group, as Lightning does
     given = ResidualVQ(16, 8, dead_code_threshold=0.0)
     given.load_state_dict(torch.load(f"{folder}/given.pt"))
+    dying = ResidualVQ(64, 8)
+    dying.load_state_dict({**dying.state_dict(), "initialized": torch.tensor(True), "ema_count": torch.zeros(1, 64)})
     meet = f"file://{folder}/meet"
     patience = datetime.timedelta(seconds=60)
     dist.init_process_group("gloo", init_method=meet, rank=rank, world_size=world, timeout=patience)
     generator = torch.Generator().manual_seed(100 + rank)  # ranks differ, in data and in draws
     with torch.no_grad():
         for step in range(6):
-            vectors = clusters(50 + 30 * rank, generator)
+            # At first more than k-means takes of a process, then fewer.
+            vectors = clusters((50 if step else 300) + 30 * rank, generator)
             mask = torch.rand(len(vectors), generator=generator) < (0.0 if (rank, step) == (1, 2) else 0.8)
             counts = book(vectors, mask, generator).counts
         given(vectors, mask, generator)
-    torch.save((book.state_dict(), given.state_dict(), vectors[mask], counts), f"{folder}/{rank}.pt")
+        dying(vectors + 100, mask, generator)  # none is near a code at zero but those of one
+    state = book.state_dict(), given.state_dict(), dying.codes[0]
+    torch.save((*state, vectors[mask], counts), f"{folder}/{rank}.pt")
     dist.destroy_process_group()
 
 
@@ -263,13 +326,17 @@ def test_codebooks_of_two_processes_stay_bit_identical(tmp_path: Path, generator
     torch.save(alone.state_dict(), tmp_path / "given.pt")
     # Forked and not spawned: importing torch anew takes half a minute on a busy machine.
     mp.start_processes(_rank, args=(2, str(tmp_path)), nprocs=2, start_method="fork")
-    (mine, given, vectors, counts), (other, other_given, more, _) = (
+    (mine, given, revived, vectors, counts), (other, other_given, other_revived, more, _) = (
         torch.load(tmp_path / f"{rank}.pt") for rank in range(2)
     )
     assert bool(mine["initialized"])
     assert all(torch.equal(mine[name], other[name]) for name in mine)
     assert all(torch.equal(given[name], other_given[name]) for name in given)
     assert counts[0].sum() == len(vectors) + len(more)
+    # Whoever takes a dead code's place is a vector of either process.
+    assert torch.equal(revived, other_revived)
+    theirs = [(revived[1:, None] == 100 + some).all(-1) for some in (vectors, more)]
+    assert torch.cat(theirs, dim=1).any(1).all() and all(some.any() for some in theirs)
     # Two processes learn what one would from all the vectors.
     alone(torch.cat([vectors, more]))
     for name, value in alone.state_dict().items():

@@ -10,7 +10,7 @@ from magnet.motion.frames import pose_features
 from magnet.motion.scene import Scene
 from magnet.tokenizer.losses import matrices, orthonormalize, reconstruction_losses
 from magnet.tokenizer.normalizer import Normalizer
-from magnet.tokenizer.vqvae import Decoder, Encoder
+from magnet.tokenizer.vqvae import VQVAE, Decoder, Encoder
 
 
 def frames_that_matter(module: torch.nn.Module, x: Tensor, step: int) -> Tensor:
@@ -59,6 +59,125 @@ def test_nothing_beyond_the_stated_reach_matters(depth: int, causal: bool, looka
     assert frame // 4 - matters.min() >= before - 3
 
 
+# -- layer by layer ----------------------------------------------------------------------------
+
+
+def plain_conv(weights: dict[str, Tensor], name: str, x: Tensor, causal: bool, stride: int = 1, gap: int = 1) -> Tensor:
+    """A convolution by its definition: each output from what its kernel lies on. (T, C) -> (T / stride, D)"""
+    weight, bias = weights[f"{name}.conv.weight"], weights[f"{name}.conv.bias"]
+    kernel = weight.shape[2]
+    span = gap * (kernel - 1) + 1
+    begins = stride - span if causal else -((span - stride) // 2)
+    out = []
+    for t in range(0, len(x), stride):
+        read = [(k, t + begins + gap * k) for k in range(kernel)]
+        out.append(bias + sum((weight[:, :, k] @ x[at] for k, at in read if 0 <= at < len(x)), torch.zeros_like(bias)))
+    return torch.stack(out)
+
+
+def plain_norm(weights: dict[str, Tensor], name: str, x: Tensor) -> Tensor:
+    off = x - x.mean(dim=-1, keepdim=True)
+    unit = off / (off.square().mean(dim=-1, keepdim=True) + 1e-5).sqrt()
+    return unit * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+
+
+def plain_stack(weights: dict[str, Tensor], name: str, x: Tensor, depth: int, causal: bool) -> Tensor:
+    for block in range(depth):
+        own, gap = f"{name}.{block}", 3 ** (depth - 1 - block)
+        y = gelu(plain_norm(weights, f"{own}.norm_1", x))
+        y = gelu(plain_norm(weights, f"{own}.norm_2", plain_conv(weights, f"{own}.conv", y, causal, gap=gap)))
+        x = x + y @ weights[f"{own}.proj.weight"].T + weights[f"{own}.proj.bias"]
+    return x
+
+
+def gelu(x: Tensor) -> Tensor:
+    return x * (1 + torch.erf(x / 2**0.5)) / 2
+
+
+def drawn(module: torch.nn.Module, generator: torch.Generator) -> dict[str, Tensor]:
+    """Weights of all of its layers at random, norms and biases too."""
+    module.double()
+    for weight in module.parameters():
+        torch.nn.init.normal_(weight, std=0.4, generator=generator)
+    return dict(module.state_dict())
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize(("unit", "embed"), [(True, 0), (False, 0), (True, 5)])
+def test_the_encoder_is_what_the_paper_has(unit: bool, embed: int, causal: bool, generator: torch.Generator) -> None:
+    """Table A.2, written out: stride 2 twice, a stack after each, its largest dilation first."""
+    encoder = Encoder(3, 4, 6, depth=2, causal=causal, unit=unit, embed=embed)
+    w, x = drawn(encoder, generator), torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    y = gelu(plain_conv(w, "layers.0", x, causal))
+    for layer in (2, 4):
+        y = plain_conv(w, f"layers.{layer}", y, causal, stride=2)
+        y = plain_stack(w, f"layers.{layer + 1}", y, 2, causal)
+    y = plain_conv(w, "layers.6", y, causal)
+    y = plain_norm(w, "layers.7", y) if unit else y
+    y = plain_conv(w, "layers.8", y, causal) if embed else y
+    torch.testing.assert_close(encoder(x[None])[0], y)
+
+
+@pytest.mark.parametrize(("causal", "lookahead"), [(False, 0), (True, 0), (True, 1)])
+def test_the_decoder_is_what_the_paper_has(causal: bool, lookahead: int, generator: torch.Generator) -> None:
+    decoder = Decoder(3, 4, 6, depth=2, causal=causal, lookahead=lookahead)
+    w, x = drawn(decoder, generator), torch.randn(12, 3, generator=generator, dtype=torch.float64)
+    y = gelu(plain_conv(w, "layers.0", x, causal and not lookahead))
+    for layer in (2, 5):
+        y = torch.stack([step for step in plain_stack(w, f"layers.{layer}", y, 2, causal) for _ in range(2)])
+        y = plain_conv(w, f"layers.{layer + 2}", y, causal)
+    y = plain_conv(w, "layers.10", gelu(plain_norm(w, "layers.8", y)), causal)
+    torch.testing.assert_close(decoder(x[None])[0], y)
+
+
+# -- what goes in and out ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def vqvae(generator: torch.Generator) -> VQVAE:
+    made = VQVAE(pose=7, latent=5, width=8, depth=1, causal=True, stride=4)
+    for standard in (made.pose, made.deltas, made.betas):
+        size = len(standard.mean)
+        standard.set(torch.randn(size, generator=generator), 0.1 + 2 * torch.rand(size, generator=generator))
+    return made
+
+
+def z(standard: Normalizer, x: Tensor) -> Tensor:
+    return (x - standard.mean) / standard.std
+
+
+def test_what_is_not_known_of_a_frame_goes_in_as_its_mean(vqvae: VQVAE, generator: torch.Generator) -> None:
+    pose, betas, deltas = (torch.randn(shape, generator=generator) for shape in ((2, 8, 7), (2, 10), (2, 8, 9)))
+    known = torch.rand(2, 8, 2, generator=generator) < 0.5
+    given = vqvae.encoder_inputs(pose, betas, deltas, known)
+    torch.testing.assert_close(given[..., :7][known[..., 0]], z(vqvae.pose, pose)[known[..., 0]])
+    torch.testing.assert_close(given[..., 7:16][known[..., 1]], z(vqvae.deltas, deltas)[known[..., 1]])
+    assert not given[..., :7][~known[..., 0]].any() and not given[..., 7:16][~known[..., 1]].any()
+    torch.testing.assert_close(given[..., 16:], z(vqvae.betas, betas)[:, None].expand(-1, 8, -1))
+    torch.testing.assert_close(vqvae.encode(pose, betas, deltas, known), vqvae.encoder(given))
+
+
+def test_tokens_are_decoded_with_their_four_deltas_and_the_shape(vqvae: VQVAE, generator: torch.Generator) -> None:
+    latent, betas, deltas = (torch.randn(shape, generator=generator) for shape in ((2, 3, 5), (2, 10), (2, 3, 4, 9)))
+    known = torch.rand(2, 3, 4, generator=generator) < 0.5
+    steps, shape = z(vqvae.deltas, deltas), z(vqvae.betas, betas)[:, None].expand(-1, 3, -1)
+    for told in (None, known):
+        moved = steps if told is None else steps * told[..., None]
+        given = vqvae.decoder_inputs(latent, betas, deltas, told)
+        torch.testing.assert_close(given, torch.cat([latent, moved.reshape(2, 3, 36), shape], dim=-1))
+        made = vqvae.decoder(given) * vqvae.pose.std + vqvae.pose.mean
+        torch.testing.assert_close(vqvae.decode(latent, betas, deltas, told), made)
+
+
+def test_shapes_are_scaled_up_by_nobody(vqvae: VQVAE) -> None:
+    """A data set of few people must not make a new person one that lies hundreds of deviations away."""
+    vqvae.betas.set(torch.zeros(10), torch.linspace(0.0, 3.0, 10))
+    assert torch.equal(vqvae.betas.std, torch.linspace(0.0, 3.0, 10).clamp(min=1.0))
+    for standard in (vqvae.pose, vqvae.deltas):
+        standard.set(torch.zeros_like(standard.mean), torch.zeros_like(standard.std))
+        assert torch.equal(standard.std, torch.full_like(standard.std, 1e-2))
+
+
 def test_embeddings_have_unit_spread() -> None:
     tokens = Encoder(5, 16, 32, depth=2, causal=False)(30 * torch.randn(4, 32, 5))
     torch.testing.assert_close(tokens.std(-1, unbiased=False), torch.ones(4, 8), rtol=1e-2, atol=0)
@@ -67,10 +186,10 @@ def test_embeddings_have_unit_spread() -> None:
 def test_z_scores_come_back_and_respect_the_floor() -> None:
     standard = Normalizer(3, floor=1e-2)
     x = torch.tensor([[1.0, 5.0, 3.0], [3.0, 5.0, 3.0]])
-    assert torch.equal(standard.normalize(x), x)
+    assert torch.equal(standard.normalize(x), x) and not standard.ready
     standard.set(x.mean(0), x.std(0, unbiased=False))
     torch.testing.assert_close(standard.normalize(x), torch.tensor([[-1.0, 0, 0], [1, 0, 0]]))
-    assert standard.std[1] == torch.tensor(1e-2)
+    assert standard.std[1] == torch.tensor(1e-2) and standard.ready
     torch.testing.assert_close(standard.denormalize(standard.normalize(x)), x)
 
 
