@@ -180,11 +180,12 @@ def answered(
 def doubted(benchmark: Benchmark, datamodule: MotionDataModule, submissions: Sequence[Submission]) -> list[str]:
     """What is unlikely of submissions beside the recorded scenes, a line each: lengths, places, the order of people."""
     scenes = list(datamodule.test_dataloader())
+    names = [name for batch in scenes for name in batch.names or ()]
     recorded = torch.cat([datamodule.body.joints(batch) for batch in scenes])
     said = []
     for each in submissions:
         joints = torch.cat([each.answer(batch, each.samples, []).transpose(0, 1) for batch in scenes])
-        told = doubts(joints, recorded, benchmark.context_frames, benchmark.sight(each.task), benchmark.fps)
+        told = doubts(joints, recorded, names, benchmark.sight(each.task), benchmark.fps)
         said += [f"{each.file or each.method}: {text}" for text in told]
     return said
 

@@ -37,6 +37,8 @@ def test_another_unit_or_axis_is_refused(name: str, task: str, tmp_path: Path) -
         Submission.load(path, benchmark)
 
 
+BY_LIMB = [0, 1, 4, 7, 10, 2, 5, 8, 11, 3, 6, 9, 12, 15, 13, 16, 18, 20, 14, 17, 19, 21]
+
 UNLIKELY: dict[str, tuple[str, Change, str]] = {
     "both swapped": ("joint_future", lambda joints: joints.flip(3), "where the other one was: are people in"),
     "one swapped": ("partner_prediction", lambda joints: joints.flip(3), "where the other one was"),
@@ -47,8 +49,45 @@ UNLIKELY: dict[str, tuple[str, Change, str]] = {
         lambda joints: joints - joints[..., :1, :],
         r"the lowest joints are at -\d\.\d m",
     ),
+    "joints by limb": ("partner_inpainting", lambda joints: joints[..., BY_LIMB, :], "joints SMPL's 22, in its order"),
     "a mean of many": ("joint_future", lambda joints: 0 * joints, "legs are 0 m long"),
 }
+
+
+def left_empty(joints: Tensor, place: tuple[int | slice, ...]) -> Tensor:
+    joints = joints.expand(-1, SAMPLES, -1, -1, -1, -1).clone()
+    joints[place] = 0.25
+    return joints
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ((slice(None), 1), "in scene 0, sample 1, frame 0, person 0, who is scored"),
+        ((4,), "in scene 4, sample 0, frame 0, person 0"),
+        ((2, 1, HORIZON - 1, 1), f"in scene 2, sample 1, frame {HORIZON - 1}, person 1, who is scored; 1 such places"),
+    ],
+)
+def test_joints_that_nobody_filled_in_are_refused(place: tuple[int | slice, ...], said: str, tmp_path: Path) -> None:
+    benchmark, _, truth = made()
+    path = submitted(left_empty(truth, place)).save(tmp_path / "a.npz", benchmark.fps)
+    with pytest.raises(ValueError, match=rf"a\.npz: joints: all are in one place {said}.*: fill them in"):
+        Submission.load(path, benchmark)
+
+
+def test_who_is_given_may_be_left_empty(tmp_path: Path) -> None:
+    benchmark, datamodule, truth = made()
+    joints = left_empty(truth, (slice(None), slice(None), slice(None), 1))
+    path = submitted(joints, "partner_prediction").save(tmp_path / "a.npz", benchmark.fps)
+    assert doubted(benchmark, datamodule, [Submission.load(path, benchmark)]) == []
+
+
+def test_a_scene_in_another_unit_is_doubted_by_its_name() -> None:
+    benchmark, datamodule, truth = made()
+    joints = truth.clone()
+    joints[3] *= 100
+    lines = doubted(benchmark, datamodule, [submitted(joints, "partner_inpainting")])
+    assert any(re.search(rf"legs are \d+ m long in {re.escape(benchmark.scenes[3])};", line) for line in lines)
 
 
 @pytest.mark.parametrize("name", UNLIKELY)
