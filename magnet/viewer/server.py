@@ -90,6 +90,8 @@ def is_foreign(origin: str | None, asked: str, local: bool) -> bool:
 def own_pages_only(local: bool) -> Iterator[None]:
     """Servers of viser that are started within answer only their own pages, which viser does not see to, and end soon.
 
+    Where a page sends what viser cannot read, a line says so in place of viser's traceback.
+
     Raises:
         ImportError: viser has started none in the way that is known.
     """
@@ -99,18 +101,31 @@ def own_pages_only(local: bool) -> Iterator[None]:
     serve, guarded = sockets.serve, []
 
     @contextlib.asynccontextmanager
-    async def guard(*where: Any, process_request: Any, **options: Any) -> AsyncIterator[Any]:
+    async def guard(talk: Any, *where: Any, process_request: Any, **options: Any) -> AsyncIterator[Any]:
         def answer(connection: Any, request: Any) -> Any:
             if is_foreign(request.headers.get("Origin"), request.headers.get("Host", ""), local):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "this viewer answers only its own pages\n")
             return process_request(connection, request)
 
+        async def talked(connection: Any) -> None:
+            try:
+                await talk(connection)
+            except Exception as error:  # whatever fails at what came; websockets closes the connection then
+                unread(error)
+
         guarded.append(True)
-        async with serve(*where, process_request=answer, **options) as server:
+        asyncio.get_running_loop().set_exception_handler(failed)
+        async with serve(talked, *where, process_request=answer, **options) as server:
             try:
                 yield server
             finally:
                 asyncio.get_running_loop().call_later(GRACE, cut, server)
+
+    def failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if isinstance(error := context.get("exception"), Exception) and "future" in context:
+            unread(error)  # of a task of viser's for a message
+        else:
+            loop.default_exception_handler(context)
 
     def cut(server: Any) -> None:
         for connection, handler in tuple(server.handlers.items()):
@@ -128,6 +143,11 @@ def own_pages_only(local: bool) -> Iterator[None]:
         raise ImportError('this viser would answer pages of other servers, too: pip install "viser==1.1.1"')
 
 
+def unread(error: Exception) -> None:
+    """Say in one line that a browser sent what viser failed at, whatever letters that held."""
+    print(f"magnet: a browser sent what the viewer cannot read: {repr(error)[:LONG]}", file=sys.stderr)
+
+
 def only_values_of_pages(server: Any) -> None:
     """Let pages set controls to nothing but what these offer: viser takes what comes, and prints what then fails.
 
@@ -143,9 +163,11 @@ def only_values_of_pages(server: Any) -> None:
         return
 
     async def heard(client_id: int, message: Any) -> None:
-        control = controls.get(message.uuid)
-        asked = control is not None and "value" in message.updates
-        said = not_offered(control, message.updates["value"]) if asked else ""
+        control, updates = controls.get(message.uuid), message.updates
+        said = ""
+        if control is not None:  # pages send values and nothing else; viser would set whatever it holds of a control
+            only = isinstance(updates, dict) and set(updates) == {"value"}
+            said = not_offered(control, updates["value"]) if only else f"{label_of(control)}: only its value can be set"
         if not said:
             await take(client_id, message)
         elif client := server.get_clients().get(client_id):
@@ -166,7 +188,12 @@ def not_offered(control: Any, value: object) -> str:
         fits, expected = number and math.isfinite(cast(float, value)), "a number"
     else:
         return ""
-    return "" if fits else f"{getattr(control, 'label', 'a control')}: got {repr(value)[:LONG]}, expected {expected}"
+    return "" if fits else f"{label_of(control)}: got {repr(value)[:LONG]}, expected {expected}"
+
+
+def label_of(control: Any) -> str:
+    """What a control is called on the page, as far as it is."""
+    return str(getattr(control, "label", "a control"))
 
 
 def literal(name: str) -> str:

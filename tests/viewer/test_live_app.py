@@ -107,6 +107,24 @@ def test_what_no_page_sends_is_refused_and_changes_nothing(
     assert len(told) == 1 and told[0].startswith(f"Not set: {said}") and controls[label].value == before
 
 
+@pytest.mark.parametrize("updates", [3, {"update_cb": []}, {"value": 2, "disabled": True}, {}])
+def test_nothing_of_a_control_but_its_value_is_set(
+    updates: Any, app: Any, controls: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """viser would put whatever it holds of a control in the page's words, what it calls among them."""
+    from viser._messages import GuiUpdateMessage
+
+    told: list[str] = []
+    client = SimpleNamespace(add_notification=lambda title, text, **_: told.append(text))
+    monkeypatch.setattr(app.server, "get_clients", lambda: {7: client})
+    control = controls["weight"]
+    before = control.value, control.disabled, control._impl.update_cb
+    message = GuiUpdateMessage(control._impl.uuid, updates)
+    asyncio.run(app.server._websock_server._handle_incoming_message(7, message))
+    assert told == ["weight: only its value can be set"]
+    assert (control.value, control.disabled, control._impl.update_cb) == before
+
+
 def test_what_a_page_sends_is_taken(app: Any, controls: dict[str, Any]) -> None:
     from viser._messages import GuiUpdateMessage
 

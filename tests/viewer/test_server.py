@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import gc
 import http.client
 import socket
 import threading
@@ -112,6 +114,46 @@ def test_a_server_stops_soon_and_wholly_though_a_browser_no_longer_answers(
         while set(threading.enumerate()) - before and time.monotonic() - begun < 4.0:
             time.sleep(0.05)
         assert not set(threading.enumerate()) - before
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        ("words", "AssertionError()"),
+        (b"\xff\x00", "DecodeError('MessagePack data is malformed"),
+        (b"\x81\xa4type\xa4Nope", "KeyError('Nope')"),
+        (b"\x81\xa4type\xa4\x1b[2J", "KeyError('\\x1b[2J')"),  # what would clear a terminal
+        (b"\x83\xa4type\xb0GuiUpdateMessage\xa4uuid\x80\xa7updates\x80", "TypeError(\"unhashable type: 'dict'\")"),
+    ],
+)
+def test_what_viser_cannot_read_is_said_in_a_line_and_the_viewer_goes_on(
+    sent: str | bytes, said: str, server: Any, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    viser = pytest.importorskip("viser")
+    from websockets.asyncio.client import connect
+    from websockets.exceptions import ConnectionClosed
+    from websockets.typing import Subprotocol
+
+    where, protocol = f"ws://127.0.0.1:{server.get_port()}", Subprotocol(f"viser-v{viser.__version__}")
+
+    async def talk(message: str | bytes | None) -> int:
+        async with connect(where, subprotocols=[protocol], max_size=None) as socket:
+            first = len(await asyncio.wait_for(socket.recv(), 20))
+            if message is not None:
+                await socket.send(message)
+                with contextlib.suppress(TimeoutError, ConnectionClosed):
+                    while True:
+                        await asyncio.wait_for(socket.recv(), 0.5)
+            return first
+
+    asyncio.run(talk(sent))
+    assert asyncio.run(talk(None)) > 0
+    gc.collect()  # asyncio tells of a task that failed once it is gone
+    lines = capsys.readouterr().err.splitlines()
+    assert lines and all(
+        line.startswith(f"magnet: a browser sent what the viewer cannot read: {said}") for line in lines
+    )
     assert not caplog.records
 
 
