@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pickle
 import random
 
 import numpy as np
@@ -159,7 +160,8 @@ def test_who_starts_again_with_a_clock_that_went_back_is_heard_once_it_was_silen
     ours = gate()
     older = pack(dataclasses.replace(message(), session=3))
     assert ours.take(pack(message()), 0.0) and ours.take(older, 2.0) is None
-    assert ours.take(older, 2.2) and ours.take(pack(message()), 2.3), "a later session replaces at once"
+    assert ours.take(older, 2.2) and ours.take(older, 2.25), "and goes on being heard"
+    assert ours.take(pack(message()), 2.3), "a later session replaces at once"
     assert ours.take(older, 4.4) is None and dict(ours.refused) == {"session": 2}
 
 
@@ -185,6 +187,107 @@ def at(frame: int, x: float, count: int = 1, **fields) -> list[bytes]:
     sent = message(frame, count, token=False)
     sent.poses[:, 0] = x
     return pack(dataclasses.replace(sent, **fields))
+
+
+def moved(**changes: float) -> list[bytes]:
+    """A message in which a number of each frame, or of its token, is another: x, y, z, w, latent or beta."""
+    sent = message(token="latent" in changes)
+    columns = {"x": 0, "y": 1, "z": 2, "w": 6}
+    for name, value in changes.items():
+        if name in columns:
+            sent.poses[:, columns[name]] = value
+        elif sent.token is not None:
+            sent.token[3] = value
+    return pack(dataclasses.replace(sent, betas=(0.0, changes.get("beta", 0.0), *([0.0] * 8))))
+
+
+BOUNDS = {
+    "x": ([1000, -1000], [1001, -1001], "range"),
+    "y": ([10, -10], [10.1, -10.1], "range"),
+    "z": ([1000, -1000], [1001, -1001], "range"),
+    "w": ([1.0099, 0.9901], [1.011, 0.989], "rotation"),
+    "latent": ([100, -100], [100.1, -100.1], "range"),
+    "beta": ([10, -10], [10.1, -10.1], "range"),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_numbers_are_let_in_up_to_their_bounds_on_both_sides(name: str) -> None:
+    within, beyond, reason = BOUNDS[name]
+    for value in within:
+        assert gate().take(moved(**{name: value}), 0.0) is not None, value
+    for value in beyond:
+        ours = gate()
+        assert ours.take(moved(**{name: value}), 0.0) is None and dict(ours.refused) == {reason: 1}, value
+
+
+@pytest.mark.parametrize(("now", "due", "first", "last"), [(400, 0, 100, 700), (400, 800, 100, 1100), (8, 8, 0, 308)])
+def test_frames_of_ten_seconds_before_and_after_are_of_use(now: int, due: int, first: int, last: int) -> None:
+    for frame, wanted in ((first - 4, False), (first, True), (last, True), (last + 4, False)):
+        ours = gate()
+        ours.now, ours.due = now, due
+        if frame >= 0:
+            assert (ours.take(pack(message(frame, token=False)), 0.0) is not None) == wanted, frame
+            assert wanted or dict(ours.refused) == {"frame": 1}
+    own = gate()
+    own.now, own.due = now, due
+    mine = dataclasses.replace(message(first, token=False), agent="A")
+    assert own.take(pack(mine), 0.0) is not None, "of oneself, too"
+
+
+def test_no_frames_are_before_the_first_ones_own_or_anothers() -> None:
+    for agent, now in (("B", None), ("B", 8), ("A", 400)):
+        ours = gate()
+        ours.now = now
+        assert ours.take(at(-1, 0.0, agent=agent), 0.0) is None
+        assert (dict(ours.refused), ours.passed_over) == ({"frame": 1}, 0)
+
+
+def test_so_many_messages_are_heard_at_once_and_a_second_and_silence_earns_no_more() -> None:
+    ours = Gate(("A", "B"), "A", "feed", LATENT)
+    parts = pack(message())
+
+    def taken(seconds: float) -> int:
+        return sum(ours.take(parts, seconds) is not None for _ in range(500))
+
+    assert [taken(0.0), taken(1.0), taken(1.5), taken(100.0), taken(50.0)] == [240, 120, 60, 240, 0]
+
+
+def test_a_token_must_be_of_this_size_upright_unmirrored_and_where_the_pelvis_is() -> None:
+    def told(change) -> str:
+        sent = message()
+        assert sent.token is not None
+        frames = sent.token[LATENT:].reshape(4, 4, 4)
+        sent.poses[:, 2] += 5.0
+        frames[:, 2, 3] = 5.0
+        token = change(sent.token, frames)
+        ours = gate()
+        ours.take(pack(dataclasses.replace(sent, token=sent.token if token is None else token)), 0.0)
+        return "".join(ours.refused)
+
+    def place(row: int, metres: float):
+        return lambda token, frames: frames.__setitem__((slice(None), row, 3), metres)
+
+    assert told(lambda token, frames: None) == ""
+    assert told(lambda token, frames: np.append(token, 0.0)) == "shape"
+    assert told(lambda token, frames: frames.__setitem__((1, 2, 2), -1.0)) == "rotation"
+    for row, near, far in ((0, 0.99, 1.01), (0, -0.99, -1.01), (2, 5.99, 6.01), (2, 4.01, 3.99)):
+        assert [told(place(row, near)), told(place(row, far))] == ["", "place"]
+
+
+def test_a_frame_that_is_told_again_may_be_a_metre_away_and_no_farther() -> None:
+    ours = gate()
+    taken = [ours.take(at(8, x), 0.0) is not None for x in (0.0, 0.9, 2.0)]
+    assert taken == [True, True, False]
+
+
+def test_what_is_remembered_of_places_is_the_newest_and_does_not_grow() -> None:
+    ours, sizes = gate(), []
+    for frame in range(0, 1600, 4):
+        assert ours.take(at(frame, 0.0, 4), 0.0)
+        sizes.append(len(pickle.dumps(ours)))
+    assert sizes[-1] < 1.1 * sizes[len(sizes) // 2]
+    assert ours.take(at(1600, 50.0), 0.0) is None and dict(ours.refused) == {"speed": 1}
 
 
 def test_a_pelvis_that_jumps_from_one_message_to_the_next_is_refused():

@@ -309,8 +309,8 @@ def _rank(rank: int, world: int, folder: str) -> None:
     generator = torch.Generator().manual_seed(100 + rank)  # ranks differ, in data and in draws
     with torch.no_grad():
         for step in range(6):
-            # At first more than k-means takes of a process, then fewer.
-            vectors = clusters((50 if step else 300) + 30 * rank, generator)
+            # At first one holds more than k-means takes of a process, then none does.
+            vectors = clusters((50 + 30 * rank) if step else (100, 300)[rank], generator)
             mask = torch.rand(len(vectors), generator=generator) < (0.0 if (rank, step) == (1, 2) else 0.8)
             counts = book(vectors, mask, generator).counts
         given(vectors, mask, generator)
