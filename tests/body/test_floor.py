@@ -60,6 +60,40 @@ def test_heights_are_those_of_the_skin():
     assert lowest(lying)[0, 0, 0] == pytest.approx(float(BODY.vertices(lying)[0, 0, 0, :, 1].min()), abs=0.12)
 
 
+@pytest.mark.parametrize("rotation", [[0, 0, 0], [-1.57, 0, 0], [0, 0, 1.57], [3.14, 0, 0], [0.4, 0, 0], [-0.5, 0, 0]])
+def test_somebody_is_as_high_as_a_sole_or_the_skin_around_a_lower_joint(rotation):
+    """Feet by their own thickness, every other joint by three centimetres."""
+    scene = still(rotation, 1.0, 1)
+    height = BODY.joints(scene)[0, 0, 0, :, 1]
+    rest = BODY.rest_joints(torch.zeros(10))[:, 1] - BODY.v_template[:, 1].min()
+    ankles, balls = rest[[7, 8]], rest[[10, 11]]
+    others = [joint for joint in range(22) if joint not in (7, 8, 10, 11)]
+    soles = torch.cat([height[[7, 8]] - torch.minimum(ankles, balls), height[[10, 11]] - balls])
+    assert lowest(scene)[0, 0, 0] == pytest.approx(float(min(soles.min(), height[others].min() - 0.03)), abs=2e-3)
+
+
+def away(height: float, frames: int, examined: int | None = None) -> float:
+    """Of one person at one height, of whom only some frames are examined."""
+    low = torch.full((1, frames, 1), height)
+    counts = torch.arange(frames)[None, :, None] < (frames if examined is None else examined)
+    return float(off_floor(low, counts, torch.full((1, 1), frames)))
+
+
+def test_a_quarter_of_a_metre_is_off_the_floor_and_in_a_leap_ninety_centimetres():
+    for frames, most in ((JUMP, 0.25), (200, 0.25), (JUMP - 1, 0.9), (1, 0.9)):
+        assert away(most - 0.01, frames) == 0.0
+        assert away(most + 0.01, frames) == pytest.approx(most + 0.01)
+        assert away(-0.24, frames) == 0.0 and away(-0.26, frames) == pytest.approx(-0.26)
+    assert away(0.5, 100, examined=8) == pytest.approx(0.5), "the frames there are count, not those examined"
+    assert away(0.5, 8) == 0.0
+
+
+def test_a_glitch_or_two_do_not_say_where_somebody_stands():
+    low = torch.full((1, 100, 1), 0.02)
+    low[:, :3] = -2.0
+    assert float(standing(low, torch.ones(1, 100, 1).bool())) == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize(
     ("rotation", "height"),
     [([-1.57, 0, 0], 0.12), ([1.57, 0, 0], 0.12), ([0, 0, 1.57], 0.7), ([3.14, 0, 0], 0.75), ([0, 0, 0], 0.93)],
@@ -173,6 +207,7 @@ def test_a_body_first_read_while_testing_can_be_fitted_afterwards():
 
 
 def test_whoever_stands_off_the_floor_of_the_others_is_named_with_centimetres() -> None:
+    assert [len(off_their_floor([metres])) for metres in (0.049, 0.051, -0.049, -0.051)] == [0, 1, 0, 1]
     near, over, under = off_their_floor([0.04, 0.09, -0.2]), off_their_floor([0.0, 0.09], ("A", "B")), [-0.2, math.nan]
     assert [text.split(":")[0] for text in near] == ["person 1", "person 2"]
     assert over[0].startswith("B: stands 9 cm over the scene's floor") and len(over) == 1
