@@ -131,8 +131,7 @@ def show(a: Side, b: Side, full: bool) -> None:
     console.print(table(results, names, found))
     if lone := len(set(one.scenes) ^ set(other.scenes)):
         console.print(f"{lone} scene{'s are' if lone > 1 else ' is'} in one of them alone and left out", style="dim")
-    narrow = "an interval is of independent scenes, resampled for both alike; with under ten of them it is too narrow"
-    console.print(narrow, style="dim")
+    console.print("an interval is of independent scenes, resampled for both alike; the fewer, the wider", style="dim")
 
 
 def scalars(text: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from magnet.files import write_text
 from magnet.metrics import Better, ClipMeans
+from magnet.metrics.interval import widening
 
 Floats = NDArray[np.float64]
 Measured = dict[str, dict[str, tuple[float, float]]]
@@ -181,20 +182,22 @@ def compared(
     sums = sums[(sums[..., 1] > 0).any(axis=1)]
     means = _means(sums.sum(axis=0))
     recorded = means[2] if real else math.nan
-    if (sums[..., 1] > 0).sum(axis=0).min() < 2:  # what one unit alone has is the same in every resample
+    counted = int((sums[..., 1] > 0).sum(axis=0).min())
+    if counted < 2:  # what one unit alone has is the same in every resample
         return Difference(means[0], means[1], means[1] - means[0], math.nan, math.nan, None, recorded)
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(sums), (RESAMPLES, len(sums)), generator=generator).numpy()
     times = np.stack([np.bincount(each, minlength=len(sums)) for each in drawn])  # (R, U)
     values = _means(np.tensordot(times, sums, axes=1))  # (R, methods)
     values = values[~np.isnan(values).any(axis=1)]
-    low, high = _ends(values[:, 1] - values[:, 0])
+    values = np.concatenate([means[None], values])  # what was measured, then the resamples
+    low, high = _ends(values[:, 1] - values[:, 0], counted)
     worse = {"low": values, "high": -values}.get(better)
     if real:
         worse = np.abs(values - values[:, 2:])
     sure = None
     if worse is not None:
-        least, most = _ends(worse[:, 1] - worse[:, 0])
+        least, most = _ends(worse[:, 1] - worse[:, 0], counted)
         sure = 1 if most < 0 else 0 if least > 0 else None
     return Difference(means[0], means[1], means[1] - means[0], low, high, sure, recorded)
 
@@ -204,7 +207,8 @@ def _means(sums: Floats) -> Floats:
     return np.divide(sums[..., 0], sums[..., 1], out=np.full(sums.shape[:-1], np.nan), where=sums[..., 1] > 0)
 
 
-def _ends(values: Floats) -> tuple[float, float]:
+def _ends(values: Floats, units: int) -> tuple[float, float]:
+    """What was measured, then resamples of so many units. -> the ends of an interval that holds with few of them too"""
     tail = 50 * (1 - LEVEL)
-    low, high = np.percentile(values, [tail, 100 - tail])
+    low, high = values[0] + widening(units) * (np.percentile(values[1:], [tail, 100 - tail]) - values[0])
     return float(low), float(high)

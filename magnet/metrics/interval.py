@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,6 +16,8 @@ Unit = Literal["auto", "take", "scene"]
 ENOUGH_TAKES = 5
 """From so many recordings on, intervals are over recordings."""
 
+STUDENT = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131)
+"""95 % of Student's t lies within so many deviations, by degrees of freedom from 1 on."""
 
 AT_ONCE = 1_000_000
 """Units that are drawn at once, to bound memory."""
@@ -101,6 +104,19 @@ def bootstrap_interval(
     tail = (1 - level) / 2
     ends = torch.quantile(total / count, torch.tensor([tail, 1 - tail], dtype=torch.float64))
     return ends[0].to(totals.device), ends[1].to(totals.device)
+
+
+def student(free: int) -> float:
+    """So many standard errors enclose 95 %, with so many degrees of freedom, at least one."""
+    return STUDENT[free - 1] if free <= len(STUDENT) else 1.96 + 2.5 / free
+
+
+def widening(units: int) -> float:
+    """What the distance of a bootstrap's 95 % ends from its estimate is multiplied by, with so few units, at least two.
+
+    Resamples spread as if the deviation had been divided by the number of units, and as if it were known exactly.
+    """
+    return student(units - 1) / 1.96 * math.sqrt(units / (units - 1))
 
 
 def histogram_of(values: Tensor, width: float, bins: int) -> Tensor:

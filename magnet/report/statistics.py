@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Verdict = Literal["holds", "does not hold", "cannot be told"]
+from magnet.metrics.interval import student
 
-STUDENT = (12.71, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131)
-"""95 % of Student's t lies within so many deviations, by degrees of freedom from 1 on."""
+Verdict = Literal["holds", "does not hold", "cannot be told"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Estimate:
         """None where nothing is known of how sure it is."""
         if self.free < 1 or not math.isfinite(self.error):
             return None
-        reach = self.error * (STUDENT[self.free - 1] if self.free <= len(STUDENT) else 1.96 + 2.5 / self.free)
+        reach = self.error * student(self.free)
         return self.value - reach, self.value + reach
 
 

@@ -133,6 +133,17 @@ def test_noise_is_not_told_from_no_difference() -> None:
     assert compared(both, both, ("a", "a"), "m", "low", "truth")[2:6] == (0, 0, 0, None)
 
 
+@pytest.mark.parametrize("units", [3, 5, 9])
+def test_of_few_scenes_as_seldom_one_is_wrongly_sure_as_of_many(units: int) -> None:
+    """In one of twenty; resamples alone would be sure of 30, 16 and 10 % with 3, 5 and 9 scenes."""
+    draws = np.random.default_rng(0).normal(size=(200, 2, units))
+    sure = 0
+    for a, b in draws:
+        both = values(a=a, b=b)
+        sure += compared(both, both, ("a", "b"), "m", "low", "truth").better is not None
+    assert sure / len(draws) < 0.075
+
+
 def test_scenes_that_are_not_independent_are_drawn_together() -> None:
     ten = [n // 4 for n in range(SCENES)]
     shift = np.repeat(np.random.default_rng(0).normal(size=10), 4)
