@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +17,10 @@ QUEUE = 64
 """Messages that wait for somebody who does not read; after that they are lost."""
 SILENT = 10.0
 """Seconds after which whoever is silent is connected to anew."""
+AGAIN = 0.25
+"""Seconds after which whoever ZeroMQ has closed the connection to, and does not connect to again, is."""
+THREADS = 32
+"""Threads of ZeroMQ, at most."""
 HERE = re.compile(r"ipc://.+|inproc://.+|tcp://(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+")
 
 
@@ -31,6 +37,30 @@ def engine() -> ModuleType:
     return zmq
 
 
+@dataclass
+class Other:
+    """Somebody who is heard, and how the connection to them is.
+
+    Attributes:
+        events: a socket on which ZeroMQ tells what happens to the connection.
+        last: when something came, or it was connected to.
+        begun: parts of a message that has not been read to its end.
+        tried: whether ZeroMQ has found where to connect to, since it last said that it would do so again.
+        met: whether the two have agreed to speak.
+        cut: when the connection was closed, unless ZeroMQ connects again.
+    """
+
+    name: str
+    address: str
+    socket: Any
+    events: Any
+    last: float = field(default_factory=time.monotonic)
+    begun: list[bytes] = field(default_factory=list)
+    tried: bool = False
+    met: bool = False
+    cut: float | None = None
+
+
 class Link:
     """What an agent sends and hears by.
 
@@ -40,13 +70,25 @@ class Link:
         connect: where each of the others tells.
         keys: folder of CURVE keys, as `make_keys` writes it: own NAME.key_secret, everybody's NAME.key. None: nothing
             is encrypted and nobody proves who they are, so addresses must be of this machine.
+        say: told in a line what happens to connections.
+
+    Attributes:
+        closed: how often ZeroMQ has closed the connection to whom, for a part over `LARGEST` or for what is no message.
 
     Raises:
         ValueError: an address of another machine without keys, a key that is not there, or an address that is taken.
     """
 
-    def __init__(self, name: str, listen: str, connect: Mapping[str, str], keys: Path | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        listen: str,
+        connect: Mapping[str, str],
+        keys: Path | None = None,
+        say: Callable[[str], object] = lambda _: None,
+    ) -> None:
         zmq = engine()
+        self.say, self.closed = say, Counter[str]()
         if keys is None:
             for address in (listen, *connect.values()):
                 if not HERE.fullmatch(address):
@@ -58,7 +100,9 @@ class Link:
             for file in (f"{name}.key_secret", *(f"{other}.key" for other in connect)):
                 if not (keys / file).is_file():
                     raise ValueError(f"{keys / file} is missing: make one with --make_keys, or copy theirs there")
-        self._zmq, self.context = zmq, zmq.Context()
+        # A thread to each address: while the name of one is looked up nothing else passes by its thread, and where a
+        # name server does not answer that takes ten seconds, again and again.
+        self._zmq, self.context = zmq, zmq.Context(io_threads=1 + min(len(connect), THREADS - 1))
         self._guard: Any = None
         try:
             self._open(name, listen, connect, keys)
@@ -70,7 +114,7 @@ class Link:
         zmq = self._zmq
         self.out = self.context.socket(zmq.PUB)
         self.out.set_hwm(QUEUE)
-        self.out.linger, self.out.ipv6 = 0, "[" in listen
+        self.out.linger, self.out.ipv6, self.out.affinity = 0, "[" in listen, 1
         mine: tuple[Any, Any] | None = None
         if keys is not None:
             import zmq.auth
@@ -84,11 +128,11 @@ class Link:
             self.out.curve_server = True
         self.out.bind(listen)
         self.poller = zmq.Poller()
-        self.inn: dict[Any, tuple[str, str]] = {}  # sockets, and of whom and where they hear
-        self._last: dict[Any, float] = {}
-        self._begun: dict[Any, list[bytes]] = {}  # messages that are not read to their ends yet
-        for other, address in connect.items():
+        self._others: dict[Any, Other] = {}  # by socket
+        self._said: set[str] = set()
+        for number, (other, address) in enumerate(connect.items()):
             socket = self.context.socket(zmq.SUB)
+            socket.affinity = 1 << 1 + number % (THREADS - 1)
             socket.set_hwm(QUEUE)
             socket.linger, socket.ipv6 = 0, "[" in address
             socket.maxmsgsize = LARGEST
@@ -96,9 +140,9 @@ class Link:
                 socket.curve_publickey, socket.curve_secretkey = mine
                 socket.curve_serverkey = zmq.auth.load_certificate(keys / f"{other}.key")[0]
             socket.subscribe(b"magnet/")
+            self._others[socket] = Other(other, address, socket, socket.get_monitor_socket())
             socket.connect(address)
             self.poller.register(socket, zmq.POLLIN)
-            self.inn[socket], self._last[socket], self._begun[socket] = (other, address), time.monotonic(), []
 
     def send(self, parts: list[bytes]) -> None:
         """Tell all who listen; never waits."""
@@ -111,31 +155,67 @@ class Link:
         """
         found = []
         for socket, _ in self.poller.poll(max(int(1000 * seconds), 0)):
-            found += [(self.inn[socket][0], parts) for parts in self._read(socket)]
-            self._last[socket] = time.monotonic()
-        self._renew()
+            found += [(self._others[socket].name, parts) for parts in self._read(self._others[socket])]
+        for other in self._others.values():
+            self._look(other)
+            self._renew(other, time.monotonic())
         return found
 
-    def _read(self, socket: Any) -> Iterator[list[bytes]]:
+    def _read(self, other: Other) -> Iterator[list[bytes]]:
         """What has come whole, part by part: a message of a million parts takes seconds, and is read in many turns."""
         for _ in range(QUEUE * PARTS):
             try:
-                part = socket.recv(self._zmq.NOBLOCK)
+                part = other.socket.recv(self._zmq.NOBLOCK)
             except self._zmq.Again:
                 return
-            if len(self._begun[socket]) <= PARTS:
-                self._begun[socket].append(part)
-            if not socket.getsockopt(self._zmq.RCVMORE):
-                parts, self._begun[socket] = self._begun[socket], []
+            other.last = time.monotonic()
+            if len(other.begun) <= PARTS:
+                other.begun.append(part)
+            if not other.socket.getsockopt(self._zmq.RCVMORE):
+                parts, other.begun = other.begun, []
                 yield parts
 
-    def _renew(self) -> None:
-        """Connect anew to who is silent: after one message over its size ZeroMQ hears nothing of an address again."""
-        for socket, (_, address) in self.inn.items():
-            if (now := time.monotonic()) - self._last[socket] > SILENT:
-                self._last[socket] = now
-                socket.disconnect(address)
-                socket.connect(address)
+    def _look(self, other: Other) -> None:
+        """Note what ZeroMQ tells of a connection, which it does at once."""
+        from zmq.utils.monitor import recv_monitor_message
+
+        zmq, name = self._zmq, other.name
+        while other.events.poll(0):
+            kind = recv_monitor_message(other.events)["event"]
+            if kind in (zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED):
+                other.tried = True
+            elif kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                other.met = True
+            elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                self._tell(f"{name} does not know our key: {name}'s folder of keys needs ours")
+            elif kind in (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL):
+                self._tell(f"what listens at {other.address} has not {name}'s keys, or one of the two has none")
+            elif kind == zmq.EVENT_DISCONNECTED:
+                other.cut, other.met, other.tried = (time.monotonic() if other.met else None), False, True
+            elif kind == zmq.EVENT_CONNECT_RETRIED:
+                if not other.tried:
+                    self._tell(f"the host of {other.address} is not found, and is looked for again and again")
+                other.cut, other.tried = None, False
+
+    def _renew(self, other: Other, now: float) -> None:
+        """Connect anew to who is silent, and soon to whom ZeroMQ does not: after one message over its size, say."""
+        cut = other.cut is not None and now - other.cut > AGAIN
+        if cut:
+            self.closed[other.name] += 1
+            self._tell(
+                f"{other.name} sent a part of over {LARGEST} bytes, or what is no message: ZeroMQ closed the "
+                "connection, which is made anew each time"
+            )
+        if cut or now - other.last > SILENT:
+            other.last, other.cut = now, None
+            other.socket.disconnect(other.address)
+            other.socket.connect(other.address)
+
+    def _tell(self, line: str) -> None:
+        """Say it, once."""
+        if line not in self._said:
+            self._said.add(line)
+            self.say(line)
 
     def close(self) -> None:
         if self._guard is not None:

@@ -110,12 +110,17 @@ def main(arguments: Sequence[str] = ()) -> int:
             file=sys.stderr,
         )
     member = member_of(given, start, names)
-    link = zeromq.Link(given.name, given.listen, connect, given.keys)
+    link = zeromq.Link(given.name, given.listen, connect, given.keys, lambda line: say(given.name, line))
     try:
         take_part(given, member, link, set(connect))
     finally:
         link.close()
     return 0
+
+
+def say(name: str, line: str) -> None:
+    """Tell, while it runs, what happens to an agent."""
+    print(f"magnet agent: {name}: {line}", file=sys.stderr, flush=True)
 
 
 def peers(connect: Sequence[str], names: Sequence[str], me: str, listen: str = "") -> dict[str, str]:
@@ -193,7 +198,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         print(f"magnet: never heard {', '.join(process.unheard)}: are addresses and keys theirs?", file=sys.stderr)
     if lag := process.report.lag():
         print(f"magnet: {lag}", file=sys.stderr)
-    report = process.report.told(member, gate, process.pace)
+    report = process.report.told(member, gate, process.pace) | {"closed": dict(link.closed)}
     print(json.dumps(report))
     if given.report is not None:
         from magnet.files import write_text

@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -31,23 +30,13 @@ from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.agentic import AgenticAsync, AgenticSync
 from magnet.testing import random_scene, tiny_denoiser
+from tests.agents.addresses import addresses_of, ports
 from tests.denoiser.test_module import save
 from tests.scripts import module_at
 
 Lossy = module_at(Path(__file__).parents[2] / "benchmarks" / "agents.py").Lossy
 
 DOCS = Path(__file__).parents[2] / "docs" / "agents.md"
-
-
-def ports(count: int) -> list[int]:
-    """Free ports of this machine."""
-    sockets = [socket.socket() for _ in range(count)]
-    for each in sockets:
-        each.bind(("127.0.0.1", 0))
-    found = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +67,6 @@ def started(folder: Path, people: int, name: str, addresses: dict[str, str], *mo
         words += ["--connect", f"{other}={addresses[other]}"]
     words += ["--model", "model.ckpt", "--steps", "2", "--out", f"{name}.npz", "--report", f"{name}.json", *more]
     return subprocess.Popen(words, cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"})
-
-
-def addresses_of(names: str) -> dict[str, str]:
-    return {name: f"tcp://127.0.0.1:{port}" for name, port in zip(names, ports(len(names)), strict=True)}
 
 
 @pytest.mark.slow
@@ -189,13 +174,6 @@ def test_the_client_in_the_docs_is_heard_and_hears(folder):
     assert len(heard) > 3 and heard[-1].startswith("A ")
 
 
-def test_without_keys_only_this_machine_is_spoken_to():
-    with pytest.raises(ValueError, match="not an address of this machine"):
-        Link("A", "tcp://0.0.0.0:5601", {})
-    with pytest.raises(ValueError, match="not an address of this machine"):
-        Link("A", "tcp://127.0.0.1:5601", {"B": "tcp://192.168.0.2:5602"})
-
-
 def test_keys_that_are_there_stay_and_those_that_are_not_are_named(tmp_path, capsys):
     assert agent.main(["--name", "A", "--make_keys", "--keys", str(tmp_path)]) == 0
     said = capsys.readouterr().out
@@ -223,95 +201,6 @@ def test_keys_that_are_there_stay_and_those_that_are_not_are_named(tmp_path, cap
 def test_addresses_that_cannot_be_are_refused(connect, said):
     with pytest.raises(CommandError, match=re.escape(said)):
         peers(connect, ("A", "B", "C"), "A", "tcp://127.0.0.1:5601")
-
-
-def test_with_keys_members_hear_each_other_and_strangers_hear_nothing(tmp_path):
-    for name in "AB":
-        make_keys(tmp_path / "ours", name)
-    make_keys(tmp_path / "theirs", "B")
-    (tmp_path / "theirs" / "A.key").write_text((tmp_path / "ours" / "A.key").read_text())
-    addresses = addresses_of("ABX")
-    one = Link("A", addresses["A"], {"B": addresses["B"]}, tmp_path / "ours")
-    two = Link("B", addresses["B"], {"A": addresses["A"]}, tmp_path / "ours")
-    stranger = Link("B", addresses["X"], {"A": addresses["A"]}, tmp_path / "theirs")
-    plain = Link("C", f"tcp://127.0.0.1:{ports(1)[0]}", {"A": addresses["A"]})
-    end, heard = time.monotonic() + 10, []
-    while not heard and time.monotonic() < end:
-        one.send([b"magnet/A", b"hello"])
-        heard = two.receive(0.05)
-    assert heard and heard[0] == ("A", [b"magnet/A", b"hello"])
-    for _ in range(3):
-        one.send([b"magnet/A", b"hello"])
-    assert stranger.receive(0.2) == [] and plain.receive(0.1) == []
-    for link in (one, two, stranger, plain):
-        link.close()
-
-
-@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
-def test_an_address_of_this_machine_may_be_of_ipv6() -> None:
-    try:
-        with socket.create_server(("::1", 0), family=socket.AF_INET6) as probe:
-            address = f"tcp://[::1]:{probe.getsockname()[1]}"
-    except OSError:
-        pytest.skip("no IPv6 address of this machine")
-    one = Link("A", address, {})
-    two = Link("B", addresses_of("B")["B"], {"A": address})
-    end, heard = time.monotonic() + 10, []
-    while not heard and time.monotonic() < end:
-        one.send([b"magnet/A", b"hello"])
-        heard = two.receive(0.05)
-    assert heard[0] == ("A", [b"magnet/A", b"hello"])
-    one.close()
-    two.close()
-
-
-def test_who_sent_a_message_over_the_size_is_heard_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """ZeroMQ gives up an address then: its next process would not be heard, either."""
-    monkeypatch.setattr("magnet.agents.zeromq.SILENT", 0.3)
-    zmq, addresses = engine(), addresses_of("AB")
-    link = Link("A", addresses["A"], {"B": addresses["B"]})
-    link.receive(0.5)  # nobody is there yet
-    context = zmq.Context()
-    out = context.socket(zmq.PUB)
-    out.bind(addresses["B"])
-
-    def hears() -> bool:
-        end = time.monotonic() + 10
-        while time.monotonic() < end:
-            out.send_multipart([b"magnet/B", b"hello"])
-            if link.receive(0.05):
-                return True
-        return False
-
-    assert hears()
-    out.send_multipart([b"magnet/B", b"x" * 70_000])
-    while link.receive(0.2):
-        pass
-    assert hears()
-    link.close()
-    context.destroy(linger=0)
-
-
-def test_a_message_of_very_many_parts_is_read_in_many_turns_and_not_kept() -> None:
-    """Else who reads it does nothing else until its end."""
-    zmq, addresses = engine(), addresses_of("AB")
-    link = Link("A", addresses["A"], {"B": addresses["B"]})
-    context = zmq.Context()
-    out = context.socket(zmq.PUB)
-    out.bind(addresses["B"])
-    turns, heard, end = 0, [], time.monotonic() + 20
-    while not heard and time.monotonic() < end:
-        out.send_multipart([b"magnet/B", b"hello"])
-        heard = link.receive(0.05)
-    out.send_multipart([b"magnet/B", *[b"x"] * 20_000])
-    out.send_multipart([b"magnet/B", b"after"])
-    while heard[-1][1][-1] != b"after" and time.monotonic() < end:
-        heard += link.receive(0.05)
-        turns += 1
-    assert turns > 50 and heard[-1] == ("B", [b"magnet/B", b"after"])
-    assert len(heard[-2][1]) == 6, "as many as are refused"
-    link.close()
-    context.destroy(linger=0)
 
 
 def relayed(stop: threading.Event, source: str, address: str, lossy: Lossy) -> None:
