@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from magnet.agents.gate import AHEAD
 from magnet.agents.message import JOINTS, LONGEST, POSE, TOKEN, Message
 from magnet.agents.rollout import OwnRollout
 from magnet.denoiser.core import DenoiserCore
@@ -127,8 +128,9 @@ class Notebook:
         """Note frames; those of a token that has come in parts are put together."""
         slot, (index, first) = self.names.index(message.agent), divmod(message.frame, TOKEN)
         pieces = self.pieces[slot]
-        if index < self.next - KEPT or len(pieces) > 4 * KEPT:
+        if index < self.next - KEPT:
             return
+        self._make_room(pieces, index)
         blank = Piece(np.zeros((TOKEN, POSE), np.float32), np.zeros(TOKEN, bool), message.betas)
         piece = pieces.setdefault(index, blank)
         if piece.there.all() and piece.token is not None:
@@ -136,6 +138,19 @@ class Notebook:
         piece.poses[first : first + len(message.poses)] = message.poses
         piece.there[first : first + len(message.poses)] = True
         piece.token, piece.betas = message.token, message.betas
+
+    @staticmethod
+    def _make_room(pieces: dict[int, Piece], index: int) -> None:
+        """Let go of what somebody who is at this token now told of far ahead, and of too much what was heard first.
+
+        A token that has come whole stays: the nearest, by which one knows where they are.
+        """
+        whole = [each for each, piece in pieces.items() if piece.there.all()]
+        kept = max((each for each in whole if each <= index), default=min(whole, default=index))
+        for each in [each for each in pieces if each > index + AHEAD // TOKEN and each != kept]:
+            del pieces[each]
+        for each in [each for each in pieces if each != kept][: len(pieces) - 4 * KEPT]:
+            del pieces[each]
 
     def come(self, slot: int, index: int) -> bool:
         """Whether a token has come whole."""

@@ -144,7 +144,7 @@ class Gate:
         known = self._places.setdefault((message.sender, message.agent), {})
         known.update({message.frame + n: pose[:3].copy() for n, pose in enumerate(message.poses)})
         while len(known) > AHEAD + BEHIND:
-            del known[min(known)]
+            del known[next(iter(known))]  # told first, which is not the first: else who told of far ahead may jump
 
     def _token(self, token: np.ndarray, place: np.ndarray) -> None:
         if len(token) != self.latent + TOKEN * 16:

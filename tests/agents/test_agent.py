@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.agents.agent import HELD, Agent, Player, motion_of, motion_told, poses_of
+from magnet.agents.agent import HELD, KEPT, Agent, Player, motion_of, motion_told, poses_of
 from magnet.agents.gate import Gate
 from magnet.agents.message import Message, pack
 from magnet.denoiser.options import Sampling
@@ -222,6 +222,35 @@ def test_who_joins_behind_somebody_of_whom_nothing_else_is_kept_holds_them_there
     assert agent.last(2) == 74 and not agent.come(2, -1)
     agent.join(70)
     assert agent.next == 70 and np.isfinite(agent.step().poses).all()
+
+
+def test_who_told_of_far_ahead_before_one_has_begun_is_where_it_tells_now(denoiser, start):
+    """C tells hundreds of tokens that are days ahead, and then what happens: as many as there is room for, and more."""
+    recording = start.permute_agents(torch.tensor([2]))
+    agent, told = Agent(denoiser, start, NAMES, "A", AgenticSync(), REFERENCE, seed=1), []
+    player = Player(cat_time([recording] * 3), start, NAMES, "C")
+    for far in (*range(10**6, 10**6 + 300), *range(2 * 10**6, 10**6, -5000)):
+        agent.hear(Message("frames", "C", "C", 0, 4 * far, 0.0, poses=poses_of(recording)[:4]))
+    assert len(agent.pieces[2]) < 300
+    for _ in range(4):
+        told.append(player.step())
+        agent.hear(told[-1])
+    assert agent.last(2) == 3 and agent.newest() == 3
+    assert all(np.array_equal(agent.pieces[2][n].poses, told[n].poses) for n in range(4))
+    agent.join()
+    assert agent.next == 4 and np.isfinite(agent.step().poses).all()
+
+
+def test_where_somebody_is_stays_known_whatever_parts_of_tokens_they_tell(denoiser, start):
+    """Of each token one frame alone, in any order: none of them comes whole."""
+    agent = Agent(denoiser, start, NAMES, "A", AgenticSync(), REFERENCE, seed=1)
+    at, draw = agent.pieces[2][-1].poses, torch.Generator().manual_seed(0)
+    for far in torch.randint(0, 10**6, (2000,), generator=draw).tolist():
+        agent.hear(Message("frames", "C", "C", 0, 4 * far, 0.0, poses=at[:1]))
+        assert len(agent.pieces[2]) <= 4 * KEPT + 1
+    agent.hear(replace(agent.step(), agent="B", sender="B", frame=40, token=None, model=""))
+    agent.join()
+    assert agent.next == 11 and np.isfinite(agent.step().poses).all()
 
 
 def test_a_free_slot_may_hold_anything_and_is_heard_of_by_nobody(denoiser, start):

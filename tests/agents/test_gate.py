@@ -318,6 +318,13 @@ def test_who_was_gone_for_two_seconds_comes_back_where_they_are_and_not_sooner()
     assert ours.take(at(88, 0.0, session=8), 0.0) is None, "a new process of theirs does not make a jump right"
 
 
+def test_who_told_of_far_ahead_before_one_has_begun_jumps_no_more_than_others():
+    ours = gate()
+    for frame in range(4000, 4700):
+        assert ours.take(at(frame, 0.0), 0.0)
+    assert ours.take(at(8, 0.0), 0.0) and ours.take(at(9, 400.0), 0.0) is None and dict(ours.refused) == {"speed": 1}
+
+
 def test_what_others_tell_of_somebody_binds_only_what_they_tell():
     """Who has come back is told of its own past by everybody; one who tells it wrong keeps nobody else out."""
     ours = Gate(("A", "B", "C"), "A", "feed", LATENT)
