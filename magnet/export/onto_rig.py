@@ -19,7 +19,8 @@ from magnet.export.fbx import as_fbx, at_whole_rate, converted
 from magnet.export.glb import FLOAT, Gltf, animation, frame_times, standing, unbroken
 from magnet.export.glb_read import GlbRig, in_one_line, read_rig
 from magnet.export.gltf_file import matrices
-from magnet.export.retarget import rests_aligned, sources
+from magnet.export.rests import rests_aligned, rests_upright
+from magnet.export.retarget import sources
 from magnet.export.rig import UP, Skeleton, rest_frame, understood_together
 from magnet.export.rig_motion import Floats, RigMotion
 from magnet.files import whole, write_text
@@ -112,6 +113,11 @@ def moved_as(scene: Scene, body: Body, skeleton: Skeleton) -> Moved:
     leans = rest_frame(rest_ours.double().numpy(), {j: j for j in range(BODY_JOINTS)}, skeleton.file.path)
     skeleton = replace(skeleton, R_rest_ours=skeleton.R_rest_ours @ leans.T)
     aligned, source = rests_aligned(skeleton, rest_ours.double()), sources(skeleton)
+    if not rests_upright(skeleton, rest_ours.double()):
+        raise ValueError(
+            f"{skeleton.file.path}: its zero pose is no pose of a person, legs are folded up beside the trunk: give "
+            "the character as it stands, such as a .glb with its mesh"
+        )
     R, at = body.bone_chain(scene.body_rot[0, :, 0].cpu(), scene.T_world_root[0, :, 0].cpu(), rest_ours)
     turned = {
         k: M.T @ R[:, j].double().numpy() @ aligned[j].T.numpy()

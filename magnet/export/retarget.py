@@ -17,16 +17,17 @@ from torch import Tensor
 from magnet.body.base import MOST_SHAPE, Body
 
 from magnet.body.joints import (  # isort: skip
-    ANKLES, COLLARS, ELBOWS, JOINT_NAMES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PARENTS,
-    PELVIS, SPINE, SPINE1, SPINE3, TOES, WRISTS,
+    COLLARS, JOINT_NAMES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PARENTS, PELVIS, SPINE,
+    SPINE1, SPINE3,
 )  # fmt: skip
-from magnet.body.fit import fit_body, floor_height, jumps_in, swing
+from magnet.body.fit import fit_body, floor_height, jumps_in
 from magnet.errors import first_names
 from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock, require_one_rate, together
 from magnet.export.read_options import Reading
-from magnet.export.rig import LIMBS, Skeleton, people_of, require_unit, require_up, understood_together
+from magnet.export.rests import rests_aligned
+from magnet.export.rig import Skeleton, people_of, require_unit, require_up, understood_together
 from magnet.export.rig_files import read_rigs
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
@@ -37,8 +38,6 @@ SIDED = {L_HIP: 1.0, L_KNEE: 1.0, L_ANKLE: 1.0, L_FOOT: 0.5, L_SHOULDER: 1.0, L_
 TARGETS = {NECK: 0.1} | {left + side: weight for left, weight in SIDED.items() for side in (0, 1)}
 """Joints that the body is fitted to, with weights. Spine, collars and head lie elsewhere in every rig: only their
 rotations are used."""
-FARTHEST_SWING = math.radians(110.0)
-"""Largest angle between a bone in our rest pose and in theirs; beyond it the bone's roll is ambiguous."""
 SAME_BODY = 0.002
 """Largest difference of rest joints, in metres, for a skeleton to count as the body's own."""
 RESTS = 2
@@ -285,29 +284,6 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
     for j, k in source.items():
         known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
     return known, source
-
-
-def rests_aligned(skeleton: Skeleton, rest: Tensor) -> dict[int, Tensor]:
-    """Rotations (3, 3) from our rest pose, rest (22, 3), to where a skeleton's bones rest; NaN: it does not tell."""
-    ours, theirs = skeleton.naming.joints, torch.from_numpy(skeleton.file.rest())
-    Q = torch.from_numpy(skeleton.R_rest_ours)
-    aligned = {j: Q for j in range(BODY_JOINTS)}
-    for left, child in LIMBS:
-        for s in (0, 1):
-            j, c = left + s, child + s
-            first = aligned[PARENTS[j]] if left in (L_KNEE, L_ANKLE, L_ELBOW) else Q
-            aligned[j] = first
-            if c not in ours:
-                continue
-            ours_bone, their_bone = first @ (rest[c] - rest[j]), theirs[ours[c]] - theirs[ours[j]]
-            cos = torch.nn.functional.cosine_similarity(ours_bone, their_bone, dim=0)
-            if torch.acos(cos.clamp(-1, 1)) <= FARTHEST_SWING:
-                aligned[j] = swing(ours_bone, their_bone) @ first
-            else:
-                aligned[j] = torch.full_like(Q, torch.nan)
-    for s in (0, 1):
-        aligned[TOES[s]], aligned[WRISTS[s]] = aligned[ANKLES[s]], aligned[ELBOWS[s]]
-    return aligned
 
 
 def sources(skeleton: Skeleton) -> dict[int, int]:
