@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -74,16 +75,28 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
         "hip": ("leg",), "knee": ("knee",), "ankle": ("ankle",), "foot": ("toe",), "collar": ("shoulder",),
         "shoulder": ("arm",), "elbow": ("elbow",), "wrist": ("wrist",), "neck": ("neck",), "head": ("head",),
     },
+    "no one program": {
+        "knee": ("knee", "shin", "calf", "lowerleg", "lowleg", "leg", "legstretch"),
+        "hip": ("upleg", "upperleg", "thigh", "hip", "leg", "thighstretch"),
+        "ankle": ("ankle", "foot"), "foot": ("ball", "toebase", "toe", "toes", "toe0", "toes01", "foot"),
+        "shoulder": ("upperarm", "uparm", "arm", "armstretch", "shldr", "shoulder"),
+        "collar": ("clavicle", "collar", "shoulder"),
+        "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "forearmstretch"), "wrist": ("wrist", "hand", "palm"),
+        "neck": ("neck", "neck1", "neck01"), "head": ("head", "head1"),
+    },
 }  # fmt: skip
 """Names of each role without the side, spaces or punctuation. One word means another joint in another scheme.
 
 CMU's bone `wrist`, which its conversions call Hand, is the last third of the forearm: the wrist is where the next one
-begins.
+begins. The last scheme is for what mixes words of the others: a word is of the first role there that it is left for, so
+that a leg beside a shin begins at the hip.
 """
 PREFIX = re.compile(r"(?i)^(bip\d+|mixamorig\d*|skeleton\d*|character\d*|def|org|j_bip|j_sec|cc_base)[ _.\-]*(?=.)")
 """What names of only some of a skeleton's joints begin with."""
 NUMBERED, MOST = re.compile(r"_(\d+)$"), 0.8
-"""The number of a node behind a joint's name, and the share of names that end in another one each where it is that."""
+"""The number of a node behind a joint's name, and the share of names that end in another one each where it is that; or
+that begin or end with the same word where it says nothing."""
+FIRST, LAST = re.compile(r"[^ _.\-]+[ _.\-]+(?=.)"), re.compile(r"[ _.\-]+[^ _.\-]+$")
 SIGNS = {"CMU": "left:hipjoint"}
 """A joint that identifies a scheme whose other names also occur in another scheme."""
 
@@ -142,25 +155,35 @@ def _matched(words: Sequence[tuple[str, set[str]]], roles: Mapping[str, tuple[st
         sides = (("left", SIDED[role]), ("right", SIDED[role] + 1)) if role in SIDED else (("", MIDDLE[role]),)
         for side, joint in sides:
             for word in (f"{side}:{name}" if side else name for name in known):
-                numbers = [k for k, (its, rests) in enumerate(words) if its in (side, "?") and word in rests]
+                free = ((k, *each) for k, each in enumerate(words) if k not in found.values())
+                numbers = [k for k, its, rests in free if its in (side, "?") and word in rests]
                 if numbers and joint not in found:
                     found[joint] = numbers[0]
     return found
 
 
 def plain(names: Sequence[str]) -> list[str]:
-    """Names without what all of them begin with: a namespace, a character's name, Bip01; and without the number of
-    the node that most end in, as Sketchfab writes it."""
+    """Names without what most of them begin or end with: a namespace, a character's name, Bip01, joint; and without the
+    number of the node that most end in, as Sketchfab writes it."""
     short = [name.rsplit(":", 1)[-1] for name in names]
     numbers = [found[1] for name in short if (found := NUMBERED.search(name))]
     if len(set(numbers)) > MOST * len(names):
         short = [NUMBERED.sub("", name) for name in short]
-    least, most = min(short, default=""), max(short, default="")
-    same = next((i for i, (a, b) in enumerate(zip(least, most, strict=False)) if a != b), min(len(least), len(most)))
-    # A prefix ends where a word does: "Left" must not be cut off from two joints that both are left.
-    cut = max((m.end() for m in re.finditer(r"[ _.\-]", least[:same])), default=0)
-    short = [name[cut:] for name in short]
-    return [PREFIX.sub("", name) for name in short]
+    before: list[str] = []
+    while short != before:
+        before, short = short, [PREFIX.sub("", name) for name in short]
+        for word in (FIRST, LAST):
+            short = _without_shared(short, word)
+    return short
+
+
+def _without_shared(names: Sequence[str], word: re.Pattern[str]) -> list[str]:
+    """Names without their first or last word, where most have the same and it is no side."""
+    ends = [found[0] if (found := word.search(name)) else "" for name in names]
+    shared, count = next(iter(Counter(ends).most_common(1)), ("", 0))
+    if not shared or count < MOST * len(names) or shared.strip(" _.-").lower() in ("l", "r", "left", "right"):
+        return list(names)
+    return [word.sub("", name, count=1) if end == shared else name for name, end in zip(names, ends, strict=True)]
 
 
 def split_side(name: str) -> tuple[str, set[str]]:
@@ -176,7 +199,7 @@ def split_side(name: str) -> tuple[str, set[str]]:
         if letters.endswith(side):
             return side, {f"{side}:{letters[: -len(side)]}"}
     words = [word.lower() for word in re.split(r"[ _.\-]+", name) if word]
-    for middle in ("c", "m"):  # centre, middle
+    for middle in ("c", "m", "x"):  # centre, middle, and Auto-Rig Pro's
         if middle in words and len(words) > 1:
             words.remove(middle)
             return "", {"".join(words)}

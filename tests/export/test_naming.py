@@ -109,6 +109,48 @@ SKELETONS: dict[str, tuple[str, str]] = {
         "Collar_L Shoulder_L Elbow_L Wrist_L Hip_L Knee_L Ankle_L Toes_L",
         "Hip_L Knee_L Ankle_L Toes_L Collar_L Shoulder_L Elbow_L Wrist_L Neck_M Head_M",
     ),
+    "DeepMotion": (
+        "Armature hips_JNT spine_JNT spine1_JNT spine2_JNT neck_JNT head_JNT l_shoulder_JNT l_arm_JNT l_forearm_JNT "
+        "l_hand_JNT l_handThumb1_JNT r_shoulder_JNT r_arm_JNT r_forearm_JNT r_hand_JNT l_upleg_JNT l_leg_JNT "
+        "l_foot_JNT l_toebase_JNT r_upleg_JNT r_leg_JNT r_foot_JNT r_toebase_JNT",
+        "l_upleg_JNT l_leg_JNT l_foot_JNT l_toebase_JNT l_shoulder_JNT l_arm_JNT l_forearm_JNT l_hand_JNT neck_JNT "
+        "head_JNT",
+    ),
+    "ARKit": (
+        "root hips_joint left_upLeg_joint left_leg_joint left_foot_joint left_toes_joint right_upLeg_joint "
+        "right_leg_joint right_foot_joint right_toes_joint spine_1_joint spine_7_joint left_shoulder_joint "
+        "left_arm_joint left_forearm_joint left_hand_joint right_shoulder_joint right_arm_joint right_forearm_joint "
+        "right_hand_joint neck_1_joint neck_2_joint head_joint",
+        "left_upLeg_joint left_leg_joint left_foot_joint left_toes_joint left_shoulder_joint left_arm_joint "
+        "left_forearm_joint left_hand_joint neck_1_joint head_joint",
+    ),
+    "Poser": (
+        "hip abdomen chest neck head lCollar lShldr lForeArm lHand rCollar rShldr rForeArm rHand lButtock lThigh lShin "
+        "lFoot lToe rButtock rThigh rShin rFoot rToe",
+        "lThigh lShin lFoot lToe lCollar lShldr lForeArm lHand neck head",
+    ),
+    "Auto-Rig Pro": (
+        "root.x spine_01.x spine_02.x neck.x head.x shoulder.l arm_stretch.l arm_twist.l forearm_stretch.l "
+        "forearm_twist.l hand.l shoulder.r arm_stretch.r forearm_stretch.r hand.r thigh_stretch.l thigh_twist.l "
+        "leg_stretch.l leg_twist.l foot.l toes_01.l thigh_stretch.r leg_stretch.r foot.r toes_01.r",
+        "thigh_stretch.l leg_stretch.l foot.l toes_01.l shoulder.l arm_stretch.l forearm_stretch.l hand.l neck.x "
+        "head.x",
+    ),
+    "SOMA": (
+        "Root Hips Spine1 Spine2 Chest Neck1 Neck2 Head Jaw LeftEye LeftShoulder LeftArm LeftForeArm LeftHand "
+        "LeftHandThumb1 RightShoulder RightArm RightForeArm RightHand LeftLeg LeftShin LeftFoot LeftToeBase RightLeg "
+        "RightShin RightFoot RightToeBase",
+        "LeftLeg LeftShin LeftFoot LeftToeBase LeftShoulder LeftArm LeftForeArm LeftHand Neck1 Head",
+    ),
+    "Synty": (
+        "Root Hips Spine_01 Spine_02 Spine_03 Neck Head Clavicle_L Shoulder_L Elbow_L Hand_L Clavicle_R Shoulder_R "
+        "Elbow_R Hand_R UpperLeg_L LowerLeg_L Ankle_L Ball_L UpperLeg_R LowerLeg_R Ankle_R Ball_R",
+        "UpperLeg_L LowerLeg_L Ankle_L Ball_L Clavicle_L Shoulder_L Elbow_L Hand_L Neck Head",
+    ),
+    "a prefix that the root has not": (
+        "Reference " + " ".join(f"Anna_{name}" for name in MIXAMO),
+        " ".join(f"Anna_{name}" for name in USUAL.split()),
+    ),
 }
 LEFT = ("left_hip", "left_knee", "left_ankle", "left_foot", "left_collar", "left_shoulder", "left_elbow", "left_wrist")
 NEEDED = tuple(ours for ours in LEFT if ours not in ("left_foot", "left_collar"))
