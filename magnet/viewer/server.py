@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import http
 import ipaddress
+import logging
 import math
 import os
 import re
@@ -86,6 +87,16 @@ def is_foreign(origin: str | None, asked: str, local: bool) -> bool:
         return True
 
 
+def has_asked(record: logging.LogRecord) -> bool:
+    """Whether what is logged is more than a connection on which no page was asked for, as browsers open to be quicker.
+
+    Of each of these websockets prints a traceback of 40 lines.
+    """
+    from websockets.exceptions import InvalidMessage
+
+    return not (record.exc_info and isinstance(record.exc_info[1], InvalidMessage))
+
+
 @contextlib.contextmanager
 def own_pages_only(local: bool) -> Iterator[None]:
     """Servers of viser that are started within answer only their own pages, which viser does not see to, and end soon.
@@ -99,6 +110,8 @@ def own_pages_only(local: bool) -> Iterator[None]:
     from websockets.protocol import State
 
     serve, guarded = sockets.serve, []
+    log = logging.getLogger("websockets.server.magnet")
+    log.addFilter(has_asked)
 
     @contextlib.asynccontextmanager
     async def guard(talk: Any, *where: Any, process_request: Any, **options: Any) -> AsyncIterator[Any]:
@@ -115,7 +128,7 @@ def own_pages_only(local: bool) -> Iterator[None]:
 
         guarded.append(True)
         asyncio.get_running_loop().set_exception_handler(failed)
-        async with serve(talked, *where, process_request=answer, **options) as server:
+        async with serve(talked, *where, process_request=answer, logger=log, **options) as server:
             try:
                 yield server
             finally:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import http.client
+import logging
 import socket
 import threading
 import time
@@ -23,7 +24,7 @@ from magnet.export.page.takes import take
 from magnet.motion.scene import Scene
 from magnet.viewer.base import has_picture
 from magnet.viewer.saving import saved
-from magnet.viewer.server import is_foreign, is_local, own_pages_only, start
+from magnet.viewer.server import has_asked, is_foreign, is_local, own_pages_only, start
 
 HERE, EVERYWHERE = True, False
 
@@ -155,6 +156,21 @@ def test_what_viser_cannot_read_is_said_in_a_line_and_the_viewer_goes_on(
         line.startswith(f"magnet: a browser sent what the viewer cannot read: {said}") for line in lines
     )
     assert not caplog.records
+
+
+def test_a_connection_that_asks_for_nothing_is_not_told_of_and_what_fails_is(
+    server: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Browsers and `ssh -L` open some that they do not need."""
+    for said in (b"", b"nonsense\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", server.get_port()), 20) as browser:
+            browser.sendall(said)
+            browser.shutdown(socket.SHUT_WR)
+            while browser.recv(1000):
+                pass
+    assert not caplog.records
+    failed = logging.makeLogRecord({"exc_info": (ValueError, ValueError("handler"), None)})
+    assert has_asked(failed) and has_asked(logging.makeLogRecord({"msg": "server closed"}))
 
 
 @pytest.mark.parametrize("notebook", [False, True])
