@@ -104,12 +104,27 @@ def on_page_read_source(page: Any, config: Any) -> str | None:
     return moved(Path(source).read_text(encoding="utf-8"), name, page.file.src_uri, {})
 
 
+def on_post_build(config: Any) -> None:
+    """Refuse a site with pictures and players that are not there: strict building looks at those of Markdown alone."""
+    site = Path(config.site_dir)
+    missing = {f"{page.relative_to(site)}: {name}" for page in site.rglob("*.html") for name in absent(page)}
+    if missing:
+        raise FileNotFoundError("\n".join(sorted(missing)))
+
+
+def absent(page: Path) -> list[str]:
+    """Files beside a page of the site that it shows and that are not there."""
+    shown = re.findall(r"<(?:img|iframe)\b[^>]*? src=\"([^\":?#]+)\"", page.read_text(encoding="utf-8"))
+    return [name for name in shown if not name.startswith("/") and not (page.parent / name).exists()]
+
+
 def moved(text: str, source: str, uri: str, brought: dict[str, bytes]) -> str:
     """A page's text with its links, as they are written in `source`, as they must be at `uri`.
 
     Files of the repository that are no pages are brought along.
     """
     from_folder, here = PurePosixPath(source).parent, PurePosixPath(uri).parent
+    served = here if PurePosixPath(uri).stem == "index" else PurePosixPath(uri).with_suffix("")
 
     def link(match: re.Match[str]) -> str:
         place = os.path.normpath(from_folder / match["target"])
@@ -123,7 +138,8 @@ def moved(text: str, source: str, uri: str, brought: dict[str, bytes]) -> str:
             brought[target] = (ROOT / place).read_bytes()
         else:
             return match[0]
-        return f"{match['open']}{os.path.relpath(target, here)}{match['rest'] or ''}{match['close']}"
+        begin = served if match["open"].endswith('"') else here  # mkdocs makes folders of pages, but leaves HTML
+        return f"{match['open']}{os.path.relpath(target, begin)}{match['rest'] or ''}{match['close']}"
 
     lines = text.splitlines(keepends=True)
     return "".join(line if line.startswith("    ") else LINK.sub(link, line) for line in lines)
