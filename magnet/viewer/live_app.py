@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from magnet.viewer.base import ViewerBase
 from magnet.viewer.clock import Clock
 from magnet.viewer.handles import KeyframePanel, Steering
 from magnet.viewer.scene_view import RenderOptions, SceneView
+from magnet.viewer.server import literal
 from magnet.viewer.timeline import Tracks
 from magnet.viewer.worker import Worker, said
 
@@ -47,6 +49,13 @@ another frame; *drag its* hand or foot by their own arrows; give it a time, whic
 def at_a_time(task: str) -> int:
     """Tokens at a time with which a task begins: who does not see two tokens of the others walks into them."""
     return 1 if task == "agentic_sync" else 2
+
+
+def described(task: Any) -> str:
+    """A task's first sentence and its formula, as Markdown."""
+    first = (inspect.getdoc(task) or "").partition("\n")[0]
+    told = "" if first.startswith(f"{task.__name__}(") else f"{literal(first)}  \n"  # a dataclass without a docstring
+    return f"{told}`{task.formula}`"
 
 
 def add_guide(server: Any) -> None:
@@ -161,11 +170,12 @@ class LiveApp(ViewerBase):
     def caption(self, frame: int) -> str:
         """Text of the panel for a frame."""
         live, rate = self.live, self.live.scene.fps
-        speed = f"{live.fps:.0f} frames/s, {live.fps / rate:.1f}x real time" if live.made else "not generated yet"
+        speed = f"generates {live.fps:.0f} frames/s, {live.fps / rate:.1f}x real time"
+        speed = speed if live.made else "the model has generated nothing yet"
         waiting = frame >= live.scene.frames - 1 and self.clock.playing and not self.worker.paused
         waits = " · **waiting for the model**" if waiting else ""
         rests = " · the model rests while it loops" if self.clock.loop else ""
-        lines = [super().caption(frame), f"generates {speed}{waits}{rests}", self.news]
+        lines = [super().caption(frame), f"{speed}{waits}{rests}", self.news]
         return "  \n".join([line for line in lines if line] + [f"**{self.refusal}**"] * bool(self.refusal))
 
     def say(self, news: str) -> None:
@@ -210,7 +220,7 @@ class LiveApp(ViewerBase):
         def apply(_: Any = None) -> None:
             fields = {each.name for each in dataclasses.fields(registry.get(task.value))}
             offset.visible, block.visible = "offset" in fields, "block" in fields
-            about.content = WHAT.get(task.value, "") or f"`{getattr(registry.get(task.value), 'formula', '')}`"
+            about.content = WHAT.get(task.value) or described(registry.get(task.value))
             with self.live.lock:
                 settings.task = task.value
                 settings.steps = int(steps.value)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 from magnet.body import Body
 from magnet.generation.live import Live
+from magnet.tasks import registry
 from magnet.testing import tiny_denoiser
+from magnet.viewer.server import literal
 
 
 @pytest.fixture
@@ -149,6 +153,25 @@ def test_the_page_says_why_a_scene_does_not_begin(app: Any, controls: dict[str, 
     for pressed in controls["Start anew"]._impl.update_cb:
         pressed(SimpleNamespace(client_id=7))
     assert "FileNotFoundError: " in app.caption(0)
+
+
+def test_who_opens_it_reads_what_the_task_does_and_that_nothing_is_made_yet(app: Any) -> None:
+    from magnet.viewer.live_app import described
+
+    app.worker.stop()
+    assert "the model has generated nothing yet" in app.caption(0)
+    app.live.advance()
+    assert re.search(r"(?m)^generates \d+ frames/s, [\d.]+x real time", app.caption(0))
+    for task in map(registry.get, registry.names()):
+        sentence, formula = described(task).split("  \n")
+        assert sentence.startswith(literal(task.__doc__.split()[0])) and formula == f"`{task.formula}`"
+
+    @dataclass(frozen=True)
+    class Bare:
+        formula: ClassVar[str] = "P(A)"
+        target: int = 0
+
+    assert described(Bare) == "`P(A)`"
 
 
 def test_who_pauses_sees_how_far_the_model_has_come_and_waits_for_nothing(app: Any) -> None:
