@@ -17,7 +17,7 @@ from magnet.viewer.clock import SPEEDS, Clock
 from magnet.viewer.saving import FORMATS, saved
 from magnet.viewer.scene_view import RenderOptions, SceneView
 from magnet.viewer.scenery import Floor
-from magnet.viewer.server import TOLD, literal, start
+from magnet.viewer.server import SHEET, TOLD, literal, start
 from magnet.viewer.timeline import Timeline, Tracks
 
 RATE = FPS
@@ -32,6 +32,8 @@ TRACKS = 8
 """Largest number of people with tracks; those of a crowd would fill the window."""
 NOBODY_LOOKS = 1.0
 """Seconds between checks whether a browser has connected."""
+PHONE, TALL = 576, 0.75
+"""Pixels of width up to which viser shows a page as on a phone, and how wide to its height such a picture is."""
 ROOM = 0.75
 """Metres around pelvises that the camera keeps visible."""
 
@@ -229,7 +231,9 @@ class ViewerBase:
         return np.array([0.0, AIM - self._covered(camera) * distance * np.tan(camera.fov / 2), 0.0])
 
     def _covered(self, camera: Any) -> float:
-        """Share of the picture's height that the timeline covers."""
+        """Share of the picture's height that the timeline covers, or of an upright phone's all controls."""
+        if camera.aspect < TALL and camera.aspect * camera.image_height <= PHONE:
+            return SHEET
         return min(self.timeline.height / max(camera.image_height, 1), 0.4)
 
     def frame_all(self) -> None:

@@ -26,6 +26,13 @@ TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
 Else it moves the bones of bodies in the picture that is about to be drawn, and colours and marks in the one after it:
 where no GPU draws, bodies were ahead of their colours and marks by a tenth of a second and more.
 """
+SHEET = 0.4
+"""Share of the height of a phone held upright that controls take; of viser's own 0.6 people stand behind them."""
+UPRIGHT = f"""<style>@media (max-width: 36em) {{
+  div[style*="max-height: 60%"] {{ max-height: {100 * SHEET:.0f}% !important; width: 100% !important; }}
+  div[style*="max-height: 60%"] div[style*="width: 20em"] {{ width: 100% !important; }}
+}}</style>"""
+"""Makes viser's (1.1) sheet of controls as wide as such a phone, and lower."""
 GRACE = 0.5
 """Seconds that browsers have to say goodbye when a server stops: one whose connection is cut never does."""
 TOLD = 15.0
@@ -49,7 +56,7 @@ def start(host: str, port: int, title: str) -> Any:
     if server.get_port() != port:
         server.stop()
         raise OSError(taken(host, port))
-    server.gui.add_html(TOGETHER)
+    server.gui.add_html(TOGETHER + UPRIGHT)
     only_values_of_pages(server)
     return server
 

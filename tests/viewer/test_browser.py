@@ -171,3 +171,23 @@ def test_the_slider_goes_through_the_steps_of_denoising(page, panel, handshake, 
             wait(lambda least=least, most=most, name=name: least <= white(shot(page, f"levels_{name}", levels)) <= most)
         assert differs(*images), "people stand where they stood after the first step"
         assert white(shot(page, "levels_last", levels)) <= 0.05, "some of the last step's levels are over 0"
+
+
+def test_on_a_phone_held_upright_the_controls_are_below_the_people(page, handshake, body) -> None:
+    page.set_viewport_size({"width": 375, "height": 667})
+    with watched(page, [take("handshake", handshake)], body, style="skeleton") as viewer:
+        viewer.clock.playing = False
+        viewer.clock.seek(60)
+        wait(lambda: viewer.shown == 60)
+        sheet = page.locator('div[style*="max-height: 60%"]').bounding_box()
+        assert sheet["width"] == 375 and sheet["y"] >= 0.6 * 667 - 1
+
+        def whole(image: np.ndarray) -> bool:
+            rows = np.flatnonzero((blue(image) | orange(image)).sum(axis=1) >= 2)
+            return len(rows) > 60 and rows[-1] < sheet["y"] - 10 and upright(orange(image))
+
+        def above() -> bool:
+            page.wait_for_timeout(2000)
+            return whole(shot(page, "watch_on_a_phone")[: int(sheet["y"])])
+
+        wait(above)

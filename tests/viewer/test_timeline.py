@@ -180,3 +180,26 @@ def test_the_camera_goes_as_far_away_as_everybody_needs_and_no_further(body, mon
     assert (low < 1 - covered).all()  # feet are above the timeline
     assert np.linalg.norm(far) * np.sin(0.35) >= 3.0
     assert np.allclose(far / np.linalg.norm(far), [0, 0, 1])  # on the line that it looked along
+
+
+@pytest.mark.parametrize(("height", "aspect", "covered"), [(667, 375 / 667, 0.4), (900, 1.5, 0.0)])
+def test_people_stand_above_the_controls_of_a_phone_held_upright(body, monkeypatch, height, aspect, covered) -> None:
+    pytest.importorskip("viser")
+    from magnet.viewer.watch import Viewer
+
+    scene = random_scene(1, 24, 2, torch.Generator().manual_seed(1))
+    roots = scene.T_world_root.clone()
+    roots[..., :3, 3] = torch.tensor([[-0.4, 0.9, 0.0], [0.4, 0.9, 0.0]])
+    viewer = Viewer([take("dance", scene.replace(T_world_root=roots))], body, port=0)
+    begin, middle = np.array([0.0, 0.85, 4.0]), np.array([0.0, 0.85, 0.0])
+    camera = SimpleNamespace(position=begin, look_at=middle, fov=0.7, aspect=aspect, image_height=height)
+    client = SimpleNamespace(client_id=0, camera=camera, atomic=viewer.server.atomic)
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: client})
+    try:
+        viewer.clock.seek(1)
+        viewer.draw()
+    finally:
+        viewer.stop()
+    ends = shares_of_height(camera, np.array([[-0.4, 0.0, 0.3], [0.4, 1.8, 0.0]]))
+    free = 1 - max(covered, viewer.timeline.height / height)
+    assert 0 < ends[1] < ends[0] < free and abs(ends.mean() - free / 2) < 0.05
