@@ -229,7 +229,7 @@ class Process:
         end = self.clock() + self.meet
         while self.clock() < end and not self._running:
             self._greet()
-            if self.others <= self._heard_by and self.others <= self._heard:
+            if self.others <= self._heard_by:  # and who has heard one has been heard
                 break
         self._hello()
         member = self.member

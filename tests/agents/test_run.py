@@ -60,6 +60,21 @@ def test_one_whose_clock_is_wrong_moves_nobody_elses_in_a_group(others):
     assert pace.start == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_tenth_of_what_the_other_is_late_is_taken_up_and_five_milliseconds_at_most():
+    for late, taken in ((0.01, 0.001), (-0.01, -0.001), (0.5, 0.005), (-0.5, -0.005)):
+        pace = Pace(0.0)
+        pace.heard("B", 0, late)
+        pace.sent(0, 0.0)
+        assert pace.start == pytest.approx(taken)
+
+
+def test_how_late_somebody_is_is_averaged_over_some_tokens_and_a_second_off_does_not_count():
+    pace = Pace(0.0)
+    for index, late in enumerate((0.1, 0.2, -5 * LOST, 5 * LOST)):
+        pace.heard("B", index, pace.due(index) + late)
+    assert pace.lateness == {"B": pytest.approx(0.7 * 0.1 + 0.3 * 0.2)}
+
+
 def test_who_is_gone_moves_nobodys_clock_any_more():
     pace = Pace(0.0)
     pace.heard("B", 0, 0.5)
@@ -98,6 +113,46 @@ def test_hellos_are_not_answered_by_hellos():
     process.meet = 1.0
     process.begin()
     assert 10 <= len(line.sent) <= 12  # one each tenth of a second, whatever comes
+
+
+def test_a_hello_is_answered_once_in_two_seconds_with_what_is_known():
+    line, process, member = begun()
+    hello = ("A", pack(Message("hello", "A", "A", 1, -1, 0.0)))
+    counts = []
+    for seconds in (0.0, 0.1, 2.0, 0.1):
+        line.now += seconds
+        before = len(line.sent)
+        hears(line, process, *[hello] * 5)
+        counts.append([message.kind for _, message in line.sent[before:]])
+    assert counts == [["frames"] * member.next, [], ["frames"] * member.next, []]
+
+
+def test_who_awaits_nobody_tells_a_token_a_token_before_it_is_due():
+    line = Line([])
+    process, _ = played(line, 0)
+    process.meet = 0.0
+    process.begin()
+    started = line.now
+    for _ in range(3):
+        process.turn()
+    sent = [at - started for at, message in line.sent if message.kind == "frames"]
+    assert sent == pytest.approx([0.0, PERIOD, 2 * PERIOD], abs=0.02)
+
+
+@pytest.mark.parametrize(("there", "joined"), [(0, 0), (2, 0), (3, 4), (9, 10)])
+def test_who_comes_while_the_others_begin_begins_too_and_later_joins(there, joined):
+    line = Line([told("A", there), told("C", there)])
+    process, member = third(line)
+    process.begin()
+    assert process.report.joined == member.next == joined
+
+
+def test_without_a_clock_one_alone_who_is_far_on_takes_nobody_along_in_a_group():
+    for coming, joined in (([told("A", 30), told("C", 0)], 0), ([told("A", 30), told("C", 20)], 21)):
+        process, member = third(Line(coming))
+        process.real_time = False
+        process.begin()
+        assert process.report.joined == member.next == joined
 
 
 def test_who_has_fallen_behind_goes_on_where_the_others_are():
