@@ -8,6 +8,7 @@ from magnet.denoiser.levels import (
     ROLES,
     UNKNOWN_AFTER,
     draw_levels,
+    drawn,
     drawn_roles,
     live_levels,
     rollout_levels,
@@ -189,6 +190,65 @@ def test_so_many_blocks_fill_the_window_as_are_asked_for(share, generator):
     flat = alike & ((levels[:, :, 0] == level[:, None]) | ~in_block).all(dim=1) & (stop > 1)
     whole = float((stop[flat] == 16).double().mean())
     assert whole == pytest.approx(share + (1 - share) / 15, abs=0.05)
+
+
+@pytest.mark.parametrize("at_once", [0.05, 0.4])
+def test_a_mixture_draws_kinds_two_to_one_to_six_and_a_half_beside_scenes_at_one_level(at_once, generator):
+    """Levels of each token, of each time step, and roll-outs, which of all levels but one are steps up or down."""
+    levels = draw_levels(NoiseOptions("mixture", at_once=at_once, from_nothing=0.0), (20_000, 16, 2), generator)
+    falls = (levels.diff(dim=1) < 0).any(dim=1)
+    token = (levels[..., 0] != levels[..., 1]).all(dim=1) & falls.all(dim=1)
+    step = (levels[..., 0] == levels[..., 1]).all(dim=1) & falls.all(dim=1)
+    rest = (1 - at_once) / (0.2 + 0.1 + 0.65)
+    assert float(token.double().mean()) == pytest.approx(0.2 * rest, abs=0.015)
+    assert float(step.double().mean()) == pytest.approx(0.1 * rest, abs=0.015)
+
+
+@pytest.mark.parametrize("shift", [1.0, 3.0])
+def test_six_of_ten_roll_outs_are_ramps_of_three_to_twelve_tokens_begun_anywhere(shift, generator):
+    levels = rollout_levels(NoiseOptions("mixture", shift), (20_000, 64, 1), generator)[..., 0].double() / LEVELS
+    even = levels / (shift - (shift - 1) * levels)  # as they were before `shifted`
+    here = (even > 0) & (even < 1)
+    first = here.int().argmax(dim=1)
+    one, two, three = (even.gather(1, (first + more).clamp_max(63)[:, None])[:, 0] for more in (0, 1, 2))
+    ramp = (here.sum(dim=1) >= 3) & (two > one + 0.01)
+    assert float(ramp.double().mean()) == pytest.approx(0.6, abs=0.04), "but for those that the window's end cuts"
+    slope = (two - one)[ramp]
+    torch.testing.assert_close((three - two)[ramp], slope, rtol=0, atol=5e-3)
+    assert 1 / 12.5 < float(slope.min()) < 1 / 11 and 1 / 3.5 < float(slope.max()) < 1 / 2.9
+    begun = one[ramp] / slope
+    assert float(begun.mean()) == pytest.approx(0.5, abs=0.03) and 0.9 < float(begun.max()) < 1.1
+
+
+@pytest.mark.parametrize(
+    ("draw", "shares"), [(rollout_levels, (0.45, 0.1, 0.37, 0.08)), (live_levels, (0.45, 0.33, 0.0, 0.22))]
+)
+def test_so_many_are_generated_given_so_far_given_and_hidden(draw, shares, generator):
+    """Of eight agents, of whom one is generated whatever is drawn, where they have roles of their own."""
+    levels = draw(NoiseOptions("mixture", from_nothing=0.0), (20_000, 16, 8), generator)
+    busy = (levels > 0) & (levels < LEVELS)
+    now = busy.any(dim=2).int().argmax(dim=1)  # the block's first token
+    at, last = levels[torch.arange(20_000), now], levels[:, -1]
+    some = busy.any(dim=2).any(dim=1) & (last == LEVELS).any(dim=1) & (now > 0) & ~(at == at[:, :1]).all(dim=1)
+    generated = busy[torch.arange(20_000), now]
+    given = (levels == 0).all(dim=1)
+    kinds = generated, (at == 0) & ~given, given, at == LEVELS
+    for found, share, forced in zip(kinds, shares, (1, 0, 0, 0), strict=True):
+        expected = forced / 8 + 7 / 8 * share
+        assert float(found[some].double().mean()) == pytest.approx(expected, abs=0.03)
+
+
+def test_what_a_place_draws_does_not_depend_on_who_shares_its_batch(generator):
+    there = torch.ones(3, 2, dtype=torch.bool)
+    seeded = [torch.Generator().manual_seed(5) for _ in range(3)]
+    whole = drawn(MIXTURE, torch.Size((3, 8, 2, 4)), seeded[0], there, places=(7, 8, 9))
+    other = drawn(MIXTURE, torch.Size((2, 8, 2, 4)), seeded[1], there[:2], places=(9, 7))
+    again = drawn(MIXTURE, torch.Size((1, 8, 2, 4)), torch.Generator().manual_seed(6), there[:1], places=(7,))
+    for mine, theirs, elsewhere in zip(whole, other, again, strict=True):
+        assert torch.equal(mine[[2, 0]], theirs)
+        assert not torch.equal(mine[:1], elsewhere), "with another seed it is another"
+    alone = drawn(MIXTURE, torch.Size((2, 8, 2, 4)), seeded[2], there[:2])
+    assert torch.equal(alone[0], draw_levels(MIXTURE, (2, 8, 2), torch.Generator().manual_seed(5), there[:2]))
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5])
