@@ -101,7 +101,7 @@ def show(a: Side, b: Side, full: bool) -> None:
     from rich.console import Console
 
     from magnet.cli.outputs import WIDE
-    from magnet.evaluation.by_scene import compared
+    from magnet.evaluation.by_scene import compared, other_recordings
     from magnet.evaluation.results import REFERENCES
 
     one, other, results = a.values, b.values, a.results
@@ -126,6 +126,11 @@ def show(a: Side, b: Side, full: bool) -> None:
         console.print(f"{letter}: {side.folder}{trained}", markup=False, highlight=False, soft_wrap=True)
     if apart := differing(a.settings(), b.settings()):
         console.print(f"settings differ: {apart}", markup=False, highlight=False, soft_wrap=True)
+    alike = a.settings()["task"] == b.settings()["task"]  # of another task other people or frames are measured
+    if alike and (strange := other_recordings(one, other, REFERENCES[0])):
+        told = f"recordings differ in {len(strange)} of them, such as {strange[0]}"
+        why = f"{REFERENCES[0]} has other numbers there: other scenes of the same name, or measured otherwise"
+        console.print(f"{told}; {why}", markup=False, highlight=False, soft_wrap=True)
     rows = (a.row, b.row)
     found = {each: compared(one, other, rows, each, results.column(each).better, REFERENCES[0]) for each in metrics}
     console.print(table(results, names, found))

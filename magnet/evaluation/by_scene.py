@@ -28,6 +28,8 @@ BY_SCENE_FORMAT = 1
 DIGITS = 7
 """Significant digits that files keep."""
 LEVEL, RESAMPLES = 0.95, 2000
+ROUGHLY = 0.01
+"""Share by which a recording's number may differ: of a frame of 150 that is over a threshold on one machine alone."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,22 @@ def compared(
         least, most = _ends(worse[:, 1] - worse[:, 0], counted)
         sure = 1 if most < 0 else 0 if least > 0 else None
     return Difference(means[0], means[1], means[1] - means[0], low, high, sure, recorded)
+
+
+def other_recordings(first: SceneValues, second: SceneValues, truth: str) -> list[str]:
+    """Scenes of one name in which recordings have other numbers in one than in the other: they are not the same motion.
+
+    truth: the recordings' row; without it nothing is known of them.
+    """
+    if truth not in first.rows or truth not in second.rows:
+        return []
+    common = [name for name in first.scenes if name in set(second.scenes)]
+    shared = [metric for metric in first.rows[truth] if metric in second.rows[truth]]
+    both = [[_means(each.sums(truth, metric, common)) for metric in shared] for each in (first, second)]
+    one, other = (np.array(each).reshape(len(shared), len(common)) for each in both)
+    says = (np.abs(one) > 0) | (np.abs(other) > 0)  # NaN and 0, which most scenes have, say nothing
+    apart = np.abs(one - other) > ROUGHLY * np.maximum(np.abs(one), np.abs(other))
+    return [name for name, much, of in zip(common, (apart & says).sum(0), says.sum(0), strict=True) if 2 * much > of]
 
 
 def _means(sums: Floats) -> Floats:

@@ -62,6 +62,26 @@ def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "1 scene is in one of them alone" in said(capsys, one, results_in(tmp_path / "c", scenes=11))
 
 
+def recorded_in(folder: Path, speed: float, task: str = "joint_future") -> Path:
+    """Results with a row of recordings, whose feet slide so fast."""
+    scenes = 6
+    rows = {"magnet": {"fs": np.stack([np.linspace(0.2, 0.3, scenes), np.ones(scenes)], axis=1)}}
+    rows["ground truth"] = {"fs": np.stack([np.linspace(0.1, 0.2, scenes) * speed, np.ones(scenes)], axis=1)}
+    values = SceneValues(tuple(f"take [{n}:{n + 1}]" for n in range(scenes)), tuple(range(scenes)), rows)
+    means = {name: {"fs": float(each["fs"][:, 0].mean())} for name, each in rows.items()}
+    outputs.write_results(Results(means, {"task": task}, {}, values), folder, {})
+    return folder
+
+
+def test_other_recordings_under_the_same_names_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = recorded_in(tmp_path / "a", 1.0)
+    text = said(capsys, one, recorded_in(tmp_path / "b", 1.3))
+    assert "recordings differ in 6 of them, such as take [0:1]; ground truth has other numbers there" in text
+    assert "recordings differ" not in said(capsys, one, recorded_in(tmp_path / "c", 1.0001))
+    text = said(capsys, one, recorded_in(tmp_path / "d", 1.3, task="partner_prediction"))
+    assert "settings differ: task" in text and "recordings differ" not in text
+
+
 def test_options_that_differ_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     held = SamplerOptions(settle="hold", steps=16, smooth_path=True)
     firm = SamplerOptions(settle="firm", steps=8, smooth_path=False, guidance=Guidance(weight=2.0))

@@ -10,7 +10,7 @@ import pytest
 import torch.distributed as dist
 import torch.multiprocessing as mp
 
-from magnet.evaluation.by_scene import SceneValues, compared, of_all_processes
+from magnet.evaluation.by_scene import SceneValues, compared, of_all_processes, other_recordings
 from magnet.evaluation.results import Results
 from magnet.metrics import ClipMeans, all_metrics
 from tests.evaluation.test_evaluator import data, run
@@ -179,3 +179,18 @@ def gather(rank: int, folder: str) -> None:
 @pytest.mark.slow
 def test_scenes_of_all_processes_are_put_in_order(tmp_path: Path) -> None:
     mp.spawn(gather, args=(str(tmp_path),), nprocs=2)
+
+
+def test_scenes_of_one_name_with_other_recordings_are_found() -> None:
+    real = values(truth=drawn(1), a=drawn())
+    other = drawn(1)
+    other[3:5] += 0.5
+    rounded = values(truth=drawn(1) * 1.0001)
+    names = real.scenes
+    assert other_recordings(real, values(truth=other), "truth") == [names[3], names[4]]
+    assert other_recordings(real, rounded, "truth") == []
+    still = values(truth=np.where(np.arange(SCENES) < 2, np.nan, 0.0))  # nothing there that says anything
+    assert other_recordings(still, still, "truth") == []
+    assert other_recordings(real, values(a=drawn(2)), "truth") == [], "a table without recordings"
+    turned = SceneValues(names[::-1], real.units, {"truth": {"m": values(truth=other).rows["truth"]["m"][::-1]}})
+    assert other_recordings(real, turned, "truth") == [names[3], names[4]]
