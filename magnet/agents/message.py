@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NoReturn
 
@@ -30,6 +30,8 @@ HEADER = 2048
 """Bytes of a header, at most."""
 LONGEST = 64
 """Letters of a name, at most."""
+LAGS = "lags"
+"""The one field of a header that may be left out."""
 KEYS = {"v", "kind", "agent", "sender", "session", "frame", "count", "clock", "betas", "model", "heard"}
 
 Kind = Literal["frames", "hello"]
@@ -53,6 +55,7 @@ class Message:
         model: fingerprint of the model that `token` is of; empty: no token.
         token: (C + 64,) float32, the normalized latent and four canonical frames (4, 4, 4).
         heard: of whom a hello's sender has heard.
+        lags: seconds by which others' tokens come to the sender later than it tells its own.
     """
 
     kind: Kind
@@ -66,6 +69,7 @@ class Message:
     model: str = ""
     token: np.ndarray | None = None
     heard: tuple[str, ...] = ()
+    lags: Mapping[str, float] = field(default_factory=dict)
 
 
 def pack(message: Message) -> list[bytes]:
@@ -76,8 +80,14 @@ def pack(message: Message) -> list[bytes]:
         "betas": list(message.betas), "model": message.model, "heard": list(message.heard),
     }  # fmt: skip
     token = b"" if message.token is None else message.token.astype("<f4").tobytes()
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    text = _text_of(header | {LAGS: {name: round(each, 4) for name, each in message.lags.items()}})
+    if not message.lags or len(text) > HEADER:  # of very many with long names
+        text = _text_of(header)
     return sealed([f"magnet/{message.sender}".encode(), text, message.poses.astype("<f4").tobytes(), token])
+
+
+def _text_of(header: Mapping[str, Any]) -> bytes:
+    return json.dumps(header, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
 
 
 def sealed(parts: Sequence[bytes]) -> list[bytes]:
@@ -112,14 +122,17 @@ def unpack(parts: Sequence[bytes]) -> Message:
         raise RefusedMessage("shape")
     if model and (count != TOKEN or len(parts[3]) <= 4 * PLACED):
         raise RefusedMessage("shape")
-    betas, heard = header["betas"], header["heard"]
+    betas, heard, lags = header["betas"], header["heard"], header.get(LAGS, {})
     if not isinstance(betas, list) or len(betas) != 10 or not isinstance(heard, list) or len(heard) > 64:
+        raise RefusedMessage("header")
+    if not isinstance(lags, dict) or len(lags) > 64:
         raise RefusedMessage("header")
     return Message(
         kind, agent, sender, _whole(header["session"], 0, 2**63), _whole(header["frame"], -1, 2**40),
         _number(header["clock"]), tuple(_number(each) for each in betas),
         np.frombuffer(parts[2], "<f4").reshape(count, POSE), model,
         np.frombuffer(parts[3], "<f4") if model else None, tuple(_text(each) for each in heard),
+        {_text(name): _number(each) for name, each in lags.items()},
     )  # fmt: skip
 
 
@@ -128,7 +141,7 @@ def _header(text: bytes) -> dict[str, Any]:
         header = json.loads(text.decode(), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         raise RefusedMessage("header") from error
-    if not isinstance(header, dict) or header.keys() != KEYS:
+    if not isinstance(header, dict) or header.keys() - {LAGS} != KEYS:
         raise RefusedMessage("header")
     return header
 

@@ -22,6 +22,8 @@ HELLO = 0.1
 """Seconds between two hellos of who has not begun."""
 GATHER = 0.5
 """Seconds for which somebody who comes back listens to what it is told."""
+AT_ONCE = 2
+"""Tokens that others may be ahead when one begins with them; where they are further, it joins them."""
 PULL = 0.1
 """Share of the difference to the others' pace that is taken up with each token."""
 MOST = 0.005
@@ -45,9 +47,11 @@ class Channel(Protocol):
 class Pace:
     """When tokens are due: so that all keep one pace though their clocks do not.
 
-    Each agent compares how late after their time the others' tokens come with how late its own are sent, and moves
-    its clock a little towards the middle of all, or towards the other's where there is one. So one alone whose clock is
-    wrong moves nobody's in a group. No clock is ever read by another.
+    Each agent compares how late after their time the others' tokens come with how late its own are sent, which it tells
+    them, and moves its clock a little towards the middle of all, or towards the other's where there is one. So one
+    alone whose clock is wrong moves nobody's in a group. No clock is ever read by another. What two tell each other
+    of their lags differs by twice what their clocks do; what is common to both is the way of a message, for which
+    nobody waits. Of who tells no lag, as another program, all of it counts.
 
     Args:
         start: when token `first` is due, in seconds.
@@ -55,6 +59,7 @@ class Pace:
 
     Attributes:
         lateness: of those who are heard, in seconds.
+        lags: by how much later they come than one's own were sent, in seconds.
         resets: how often the clock was set anew, being behind.
         lost: seconds by which it was, together.
     """
@@ -62,9 +67,11 @@ class Pace:
     start: float
     first: int = 0
     lateness: dict[str, float] = field(default_factory=dict)
+    lags: dict[str, float] = field(default_factory=dict)
     resets: int = 0
     lost: float = 0.0
     _told: dict[str, float] = field(default_factory=dict, init=False, repr=False)
+    _theirs: dict[str, float | None] = field(default_factory=dict, init=False, repr=False)
 
     def due(self, index: int) -> float:
         return self.start + (index - self.first) * PERIOD
@@ -73,22 +80,25 @@ class Pace:
         """The token that one would be at, had one never been late."""
         return self.first + math.floor((at - self.start + self.lost) / PERIOD)
 
-    def heard(self, name: str, index: int, at: float) -> None:
-        """A token of somebody has come."""
+    def heard(self, name: str, index: int, at: float, lag: float | None = None) -> None:
+        """A token of somebody has come, who says by how much later they hear oneself than they tell."""
         now = at - self.due(index)
         if abs(now) < LOST:
+            self._theirs[name] = lag if lag is not None and abs(lag) < LOST else None
             self.lateness[name], self._told[name] = 0.7 * self.lateness.get(name, now) + 0.3 * now, at
 
     def sent(self, index: int, at: float) -> float:
         """An own token has been sent. Returns by how much it was late."""
         late = at - self.due(index)
         self.lateness = {name: each for name, each in self.lateness.items() if at - self._told[name] <= AWAY}
+        self.lags = {name: each - late for name, each in self.lateness.items()}
         if late > LOST:
             self.start, self.lost, self.resets = self.start + late, self.lost + late, self.resets + 1
             self.lateness.clear()
-        elif self.lateness:
-            theirs = list(self.lateness.values())
-            off = statistics.median(theirs if len(theirs) == 1 else [*theirs, late]) - late
+            self.lags.clear()
+        elif self.lags:
+            offs = [lag if (one := self._theirs[name]) is None else (lag - one) / 2 for name, lag in self.lags.items()]
+            off = statistics.median(offs if len(offs) == 1 else [*offs, 0.0])
             self.start += max(-MOST, min(MOST, PULL * off))
         return late
 
@@ -200,9 +210,11 @@ class Process:
                 continue
             if message.agent == message.sender:
                 self._running[message.sender] = at
+                slot, index = self.member.names.index(message.sender), message.frame // TOKEN
+                again = self.member.come(slot, index)  # as somebody is told who comes back, and all hear
                 self.member.hear(message)
-                if self.pace is not None:
-                    self.pace.heard(message.sender, message.frame // TOKEN, at)
+                if self.pace is not None and not again:
+                    self.pace.heard(message.sender, index, at, message.lags.get(self.name))
             elif self.pace is None:  # who has begun knows better where it is than others do
                 self.member.hear(message)
 
@@ -214,7 +226,8 @@ class Process:
                 self._send(message)
 
     def _send(self, message: Message) -> None:
-        self.link.send(pack(replace(message, session=self.session, clock=time.time())))
+        lags = self.pace.lags if self.pace is not None and message.agent == self.name else {}
+        self.link.send(pack(replace(message, session=self.session, clock=time.time(), lags=lags)))
 
     def _hello(self) -> None:
         self._send(Message("hello", self.name, self.name, 0, -1, 0.0, heard=tuple(sorted(self._heard))))
@@ -233,11 +246,12 @@ class Process:
                 break
         self._hello()
         member = self.member
-        if self._running:
+        met = self.others <= self._heard_by and self.others <= self._heard
+        if self._running and not (met and self._there() <= AT_ONCE):  # who has just met needs not be told of before
             self._gather(GATHER)
             there = self._there()
             begun = sum(map(self._far_on, self._running)) >= min(2, len(self._running))
-            late = there > 2 if self.real_time else begun
+            late = there > AT_ONCE if self.real_time else begun
             if late:
                 member.join(there + 1)
                 self.report.joined = member.next

@@ -29,8 +29,11 @@ def message(frame: int = 8, count: int = 4, token: bool = True) -> Message:
     return Message("frames", "B", "B", 7, frame, 1.5, poses=poses, model="feed" if token else "", token=told)
 
 
+LAGGING = dataclasses.replace(message(), lags={"A": -0.25, "\u9f8d": 0.0625})
+
+
 def test_a_message_comes_back_as_it_was():
-    for sent in (message(), message(9, 2, token=False), Message("hello", "B", "B", 1, -1, 0.0, heard=("A",))):
+    for sent in (message(), message(9, 2, token=False), Message("hello", "B", "B", 1, -1, 0.0, heard=("A",)), LAGGING):
         back = unpack(pack(sent))
         for field in dataclasses.fields(Message):
             ours, theirs = getattr(sent, field.name), getattr(back, field.name)
@@ -42,6 +45,11 @@ def test_the_longest_names_of_any_script_fit_into_a_hello():
     names = tuple(letter * 64 for letter in "A\u9f8d\u0939\U0001f916")
     hello = Message("hello", names[3], names[3], 2**62, -1, 1.5e9, heard=names[:3])
     assert Gate(names, names[0], "", 0).take(pack(hello), 0.0) is not None
+
+
+def test_lags_of_too_many_for_a_header_are_left_out():
+    sent = dataclasses.replace(message(), lags={60 * "A" + str(number): 0.1 for number in range(40)})
+    assert unpack(pack(sent)).lags == {} and gate().take(pack(sent), 0.0) is not None
 
 
 def changed(**fields) -> list[bytes]:
@@ -66,7 +74,10 @@ def told(number: int, value: float) -> list[bytes]:
 WRONG = {
     "version": [changed(v=2), changed(v="1")],
     "header": [
-        changed(extra=1), changed(frame="8"), changed(frame=8.5), changed(frame=True), changed(frame=-2),
+        changed(extra=1),
+        changed(lags=[]), changed(lags={"A": "late"}), changed(lags={"A": None}), changed(lags={65 * "A": 0.1}),
+        changed(lags={str(number): 0.1 for number in range(65)}),
+        changed(frame="8"), changed(frame=8.5), changed(frame=True), changed(frame=-2),
         changed(count=5), changed(session=-1), changed(betas=[0] * 9), changed(betas=[None] * 10), changed(clock="now"),
         changed(heard="A"), changed(heard=[1]), changed(sender=3), changed(model="f" * 65), changed(clock=10**400),
         sealed([b"magnet/B", b"[" * 2000, b"", b""]), sealed([b"magnet/B", b"\xff{}", b"", b""]),

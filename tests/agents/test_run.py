@@ -10,21 +10,27 @@ import torch
 from magnet.agents.agent import Player
 from magnet.agents.gate import Gate
 from magnet.agents.message import Message, pack, unpack
-from magnet.agents.run import AWAY, LOST, PERIOD, Pace, Process, Report
+from magnet.agents.run import AWAY, GATHER, LOST, PERIOD, Pace, Process, Report
 from magnet.testing import random_scene
 
 
-def drifting(rates: list[float], tokens: int, pull: bool = True) -> list[list[float]]:
-    """When each agent sends each token, in true time; their clocks run at these rates, and begin a little apart."""
+def drifting(
+    rates: list[float], tokens: int, pull: bool = True, way: float = 0.002, telling: bool = False
+) -> list[list[float]]:
+    """When each agent sends each token, in true time; their clocks run at these rates, and begin a little apart.
+
+    A message takes `way` seconds; telling: it says how late its sender hears the others.
+    """
     paces = [Pace(0.03 * number * rate) for number, rate in enumerate(rates)]
     sent: list[list[float]] = [[] for _ in rates]
     for index in range(tokens):
         now = [pace.due(index) / rate for pace, rate in zip(paces, rates, strict=True)]
+        lags = [pace.lags.get if telling else {}.get for pace in paces]
         for me, (pace, rate) in enumerate(zip(paces, rates, strict=True)):
             sent[me].append(now[me])
             for other, at in enumerate(now):
                 if pull and other != me:
-                    pace.heard(str(other), index, (at + 0.002) * rate)
+                    pace.heard(str(other), index, (at + way) * rate, lags[other](str(me)))
             pace.sent(index, now[me] * rate)
     return sent
 
@@ -38,6 +44,28 @@ def test_agents_keep_one_pace_though_their_clocks_drift(rates):
     spread = [max(each) - min(each) for each in zip(*together, strict=True)]
     assert max(spread[30:]) < PERIOD
     assert 0.985 < (together[0][-1] - together[0][0]) / 120 < 1.015
+
+
+@pytest.mark.parametrize("way", [0.1, 0.3])
+@pytest.mark.parametrize("rates", [[1.0, 1.0], [1.0, 1.01], [0.99, 1.0, 1.01]])
+def test_a_long_way_between_agents_slows_nobody(rates, way):
+    """Each hears the others late, and does not wait for them; agents who did not tell theirs lost 2 s in a minute."""
+    tokens = round(60 / PERIOD)
+    sent = drifting(rates, tokens, way=way, telling=True)
+    for each, rate in zip(sent, rates, strict=True):
+        assert abs((each[-1] - each[30]) / ((tokens - 31) * PERIOD) - 1) < 0.0055, rate
+    assert max(max(each) - min(each) for each in zip(*sent, strict=True)) < 0.1
+    silent = drifting(rates, tokens, way=way)
+    assert silent[0][-1] > sent[0][-1] + 1.0
+
+
+@pytest.mark.parametrize("lag", [-1.5, 20.0])
+def test_lags_that_cannot_be_are_not_counted(lag):
+    told, untold = Pace(0.0), Pace(0.0)
+    for pace, said in ((told, lag), (untold, None)):
+        pace.heard("B", 0, 0.02, said)
+        pace.sent(0, 0.0)
+    assert told.start == untold.start == pytest.approx(0.002)
 
 
 def test_who_is_far_behind_sets_its_clock_anew():
@@ -153,6 +181,41 @@ def test_without_a_clock_one_alone_who_is_far_on_takes_nobody_along_in_a_group()
         process.real_time = False
         process.begin()
         assert process.report.joined == member.next == joined
+
+
+def test_who_has_met_all_begins_with_them_though_one_has_told_its_first_token_by_then():
+    """It was a hello quicker; who listened to what had been before missed its own first tokens."""
+    line = Line([])
+    process, member = played(line, 1)
+    line.coming.insert(0, ("A", pack(Message("hello", "A", "A", 1, -1, 0.0, heard=("B",)))))
+    process.begin()
+    assert member.next == 0 and process.report.joined == 0 and line.now < GATHER
+    back, other = played(line, 1)  # it has not heard whom A has heard
+    begun = line.now
+    back.begin()
+    assert other.next == 0 and line.now - begun > GATHER
+
+
+def test_what_is_told_again_makes_nobody_late():
+    """Who comes back is told the last ten tokens by the others, and everybody hears it."""
+    line, process, _ = begun()
+    hears(line, process, told("A", 1), told("C", 1))
+    assert process.pace is not None
+    before = dict(process.pace.lateness)
+    line.now += 0.9
+    hears(line, process, told("A", 1))
+    assert process.pace.lateness == before
+    hears(line, process, told("A", 2))
+    assert process.pace.lateness["A"] > before["A"]
+
+
+def test_each_token_says_how_late_the_others_are_heard_and_a_hello_does_not():
+    line, process, _ = begun()
+    hears(line, process, told("A", 0))
+    for _ in range(2):
+        process.turn()
+    lags = [message.lags for _, message in line.sent]
+    assert lags[:3] == [{}, {}, {}] and list(lags[-1]) == ["A"]
 
 
 def test_who_has_fallen_behind_goes_on_where_the_others_are():
