@@ -14,6 +14,8 @@ CLEAR, LONG = 0.95, 0.7
 """Least share of an axis in a torso that rests along it, and in the mean torso of a take."""
 MOST_RISEN = 0.25
 """Leg lengths between the heights of a pelvis in most frames (15 to 85 %) of somebody who lies, at most."""
+ON_FLOOR, OFF_FLOOR = 0.1, 0.25
+"""Leg lengths from zero within which the lowest joint of somebody on a floor is, and from which on there is none."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,15 @@ class Stance:
     def may_lie(self, up: str) -> bool:
         """Whether somebody who does not stand along this axis may lie all the time."""
         return bool(self.moved["xyz".index(up[-1])] <= MOST_RISEN)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the world was surely turned after the rest pose: who stands moves along what the rest pose calls up,
+        or is on the floor along the torso and not along that."""
+        if self.shown is None or self.rest in (None, self.shown):
+            return False
+        on_floor = abs(self.floor(self.shown)) <= ON_FLOOR and abs(self.floor(self.rest or "")) >= OFF_FLOOR
+        return on_floor or not self.may_lie(self.rest or "")
 
     def floor(self, up: str) -> float:
         """Leg lengths of the lowest joint over zero."""
@@ -80,10 +91,12 @@ def agreed(stances: Sequence[Stance]) -> list[str]:
     """The axis that points up in each file of one scene; files of different programs may have different ones.
 
     A rest pose counts where the motion contradicts it: somebody may lie. Whoever's rest pose does not tell has the
-    axis of the others, unless they move up and down along it as nobody does who lies.
+    axis of the others, unless they move up and down along it as nobody does who lies. A world that was turned after the
+    rest pose for one is so for all who stand and rest like them.
     """
     sure = {one.rest for one in stances if one.rest is not None and one.rest == one.shown}
-    found = [_rested(one, sure) for one in stances]
+    turned = {(one.rest, one.shown) for one in stances if one.turned}
+    found = [_rested(one, sure, turned) for one in stances]
     axes = sorted({axis for axis in found if axis is not None})
     if not axes:
         return _without_rest(stances)
@@ -92,15 +105,14 @@ def agreed(stances: Sequence[Stance]) -> list[str]:
     return [_beside(one, axes, ground) if axis is None else axis for one, axis in pairs]
 
 
-def _rested(one: Stance, sure: set[str]) -> str | None:
+def _rested(one: Stance, sure: set[str], turned: set[tuple[str | None, str | None]]) -> str | None:
     """By the rest pose, beside files of which the axis is sure; None: it does not tell."""
     if one.rest is None:
         return None
     for axis in (one.rest, one.shown):
         if axis in sure:
             return axis
-    # A world that was turned after the rest pose: whoever stands there walks along what the rest pose calls up.
-    return one.rest if one.shown is None or one.may_lie(one.rest) else one.shown
+    return one.shown if (one.rest, one.shown) in turned else one.rest
 
 
 def _beside(one: Stance, axes: Sequence[str], ground: float) -> str:
