@@ -47,7 +47,8 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str
 
     A person is a skin's skeleton, and the skins of clothes and hair on it; in a file without skins, every tree of nodes
     that moves. They rest as they were bound to their skins. Keyframes are read at their own rate, and those that are
-    uneven, or fewer than ten a second, at 30 a second. Of animations that move the same nodes the first is read.
+    uneven, or fewer than ten a second, at 30 a second. Of animations that move the same nodes the first is read that is
+    no pose.
 
     Args:
         path: the file.
@@ -169,24 +170,29 @@ def _animations(file: GltfFile) -> list[dict[str, Any]]:
 def _tracks(file: GltfFile, clip: str | None) -> tuple[Tracks, list[str]]:
     """What moves nodes, and notes on animations that are left out."""
     tracks: Tracks = {}
-    taken: dict[int, str] = {}
+    taken: dict[tuple[int, str], str] = {}
     left: list[str] = []
     named = [(str(each.get("name") or f"animation {k}"), each) for k, each in enumerate(_animations(file))]
     chosen = [(name, each) for name, each in named if clip in (None, name)]
     if clip is not None and not chosen:
         raise ValueError(f"has no animation {clip!r}; it has {', '.join(name for name, _ in named) or 'none'}")
-    for name, animation in chosen:
+    # A pose comes last: many files have one before their motion, such as Mixamo's empty take.
+    for name, animation in sorted(chosen, key=lambda each: _is_pose(file, each[1])):
         channels = [each for each in animation["channels"] if each["target"].get("path") in DEFAULTS]
-        nodes = {channel["target"]["node"] for channel in channels if "node" in channel["target"]}
-        if both := nodes & set(taken):
+        own = {(each["target"]["node"], each["target"]["path"]): each for each in channels if "node" in each["target"]}
+        if both := own.keys() & taken:
             left.append(f"animation {name!r} is not read: it moves what {taken[min(both)]!r} moves; --clip chooses")
             continue
-        taken |= dict.fromkeys(nodes, name)
-        for channel in channels:
-            if "node" in channel["target"]:
-                what = channel["target"]["path"]
-                tracks[channel["target"]["node"], what] = _track(file, animation["samplers"][channel["sampler"]], what)
+        taken |= dict.fromkeys(own, name)
+        for (node, what), channel in own.items():
+            tracks[node, what] = _track(file, animation["samplers"][channel["sampler"]], what)
     return tracks, left
+
+
+def _is_pose(file: GltfFile, animation: dict[str, Any]) -> bool:
+    """Whether nothing changes in an animation."""
+    outputs = (file.numbers(sampler["output"]) for sampler in animation["samplers"])
+    return all(bool((values[1:] == values[:-1]).all()) for values in outputs)
 
 
 def _track(file: GltfFile, sampler: dict[str, Any], what: str) -> Track:

@@ -160,6 +160,32 @@ def test_an_animation_is_chosen_by_its_name(duet: Scene, body: Body, tmp_path: P
     assert cli.main(["export", str(path), str(tmp_path / "c.npz"), "--clip", "stand"]) == 0
 
 
+def test_a_pose_before_the_motion_is_not_read_in_its_place(duet: Scene, body: Body, tmp_path: Path) -> None:
+    """As Mixamo's empty take, and the T pose that characters of games have first: it was read, as one frame."""
+    glb = glb_strangers.opened(stranger(duet, body, tmp_path / "a.glb"))
+    moves = glb.document["animations"]
+    zero, unturned = glb.numbers(np.zeros((1, 1)), "SCALAR"), glb.numbers(np.array([[0.0, 0.0, 0.0, 1.0]]), "VEC4")
+    still = [{"sampler": 0, "target": channel["target"]} for clip in moves for channel in clip["channels"]]
+    still = [channel for channel in still if channel["target"]["path"] == "rotation"]
+    pose = {"name": "TPose", "channels": still, "samplers": [{"input": zero, "output": unturned}]}
+    glb.document["animations"] = [pose, *moves]
+    got = read(glb.save(tmp_path / "b.glb"))
+    assert off(got.scene, duet, body) < 1e-4
+    assert "animation 'TPose' is not read" in "".join(got.notes)
+
+
+def test_channels_that_are_an_animation_each_are_one_motion(duet: Scene, body: Body, tmp_path: Path) -> None:
+    """Of each bone only the first channel was read, which left people with no turns or in one place."""
+    glb = glb_strangers.opened(stranger(duet, body, tmp_path / "a.glb"))
+    glb.document["animations"] = [
+        {"channels": [channel | {"sampler": 0}], "samplers": [clip["samplers"][channel["sampler"]]]}
+        for clip in glb.document["animations"]
+        for channel in clip["channels"]
+    ]
+    got = read(glb.save(tmp_path / "b.glb"))
+    assert off(got.scene, duet, body) < 1e-4 and "not read" not in "".join(got.notes)
+
+
 def test_controls_beside_the_hips_hang_on_the_armature_which_is_the_root(
     duet: Scene, body: Body, tmp_path: Path
 ) -> None:
