@@ -165,7 +165,7 @@ def _matched(words: Sequence[tuple[str, set[str]]], roles: Mapping[str, tuple[st
 def plain(names: Sequence[str]) -> list[str]:
     """Names without what most of them begin or end with: a namespace, a character's name, Bip01, joint; and without the
     number of the node that most end in, as Sketchfab writes it."""
-    short = [name.rsplit(":", 1)[-1] for name in names]
+    short = [re.split(r"[:|](?=.)", name)[-1] for name in names]
     numbers = [found[1] for name in short if (found := NUMBERED.search(name))]
     if len(set(numbers)) > MOST * len(names):
         short = [NUMBERED.sub("", name) for name in short]

@@ -27,6 +27,10 @@ SKELETONS: dict[str, tuple[str, str]] = {
         " ".join(f"anna:rig:{x}" for x in MIXAMO),
         " ".join(f"anna:rig:{x}" for x in USUAL.split()),
     ),
+    "paths in Maya": (
+        " ".join(f"|anna|{x}" for x in MIXAMO),
+        " ".join(f"|anna|{x}" for x in USUAL.split()),
+    ),
     "Sketchfab": (
         " ".join(f"mixamorig:{name}_{k:02}" for k, name in enumerate(MIXAMO)),
         " ".join(f"mixamorig:{name}_{MIXAMO.index(name):02}" for name in USUAL.split()),
