@@ -46,7 +46,7 @@ AGENTS: tuple[Colour, ...] = (
     (18, 158, 128),
     (116, 92, 70),
     (70, 178, 226),
-    (176, 160, 20),
+    (80, 32, 192),
 )
 """One colour per agent slot, distinguishable with common colour blindness; none is pink."""
 
