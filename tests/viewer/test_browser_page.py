@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from magnet.body.contact import deepest
+from magnet.body.joints import TOES
 from magnet.export.page.html import save_html
 from magnet.export.page.light import light
+from magnet.synthesis.generate import synthesize
 from magnet.testing import random_scene
 from tests.viewer.browser import blue, orange, pale_orange, shot, upright
 
@@ -219,6 +221,62 @@ def test_the_page_marks_how_deep_people_are_in_each_other_until_marks_are_off(pa
     page.locator("#marks").click()
     after = looked_at("page_marks_off", "")
     assert reddish(after)[40:380].sum() < 10 and reddish(after)[400:].sum(axis=1).max() < 40
+
+
+def test_what_marks_mean_is_written_in_the_picture_while_they_are_on(page, handshake, body, tmp_path) -> None:
+    near = handshake.T_world_root.clone()
+    near[:, 40:, 1, :3, 3] = near[:, 40:, 0, :3, 3] + torch.tensor([0.05, 0.0, 0.05])
+    deep = handshake.replace(T_world_root=near)
+    for scene, said in ((handshake, False), (deep, True)):
+        page.goto(save_html(scene, tmp_path / "a.html", body, styles=("skeleton",)).as_uri())
+        page.wait_for_function("window.player && player.drawn > 0")
+        words = page.locator("#legend").inner_text()
+        assert ("in each other, 5 to 10 cm and more" in words) == said and "hands touch" in words
+    page.locator("#marks").click()
+    assert not page.locator("#legend").is_visible()
+
+
+def test_keys_turn_and_zoom_and_those_of_the_browser_are_left_to_it(page, handshake, body, tmp_path) -> None:
+    page.goto(save_html(handshake, tmp_path / "a.html", body, styles=("skeleton",)).as_uri())
+    page.wait_for_function("window.player && player.drawn > 0")
+    page.evaluate("player.seek(60)")
+    looks = "[player.view.distance, player.view.azimuth, player.view.elevation]"
+    far, around, above = page.evaluate(looks)
+    for key in ("+", "Shift+ArrowRight", "Shift+ArrowUp"):
+        page.keyboard.press(key)
+    nearer, turned, higher = page.evaluate(looks)
+    assert nearer < far and turned != around and higher > above
+    page.evaluate("addEventListener('keydown', (event) => (window.taken = event.defaultPrevented))")
+    for key, taken in (("Alt+ArrowRight", False), ("Control+ArrowRight", False), ("ArrowRight", True)):
+        page.keyboard.press(key)
+        assert page.evaluate("taken") == taken
+    assert page.evaluate("player.frame") == 61
+    page.wait_for_function("document.getElementById('time').ariaValueText === '2.03 s / 4.2 s'")
+
+
+def test_on_paper_people_keep_their_shape_and_without_scripts_the_page_says_what_it_needs(
+    page, chromium, handshake, body, tmp_path
+) -> None:
+    path = save_html(handshake, tmp_path / "a.html", body, styles=("skeleton",)).as_uri()
+    page.goto(path)
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.getElementById('canvas')).objectFit") == "contain"
+    assert not page.locator("#play").is_visible() and page.locator("#time").is_visible()
+    bare = chromium.new_page(java_script_enabled=False)
+    bare.goto(path)
+    assert bare.locator("noscript").is_visible()
+    bare.close()
+
+
+def test_feet_of_a_circle_of_people_are_in_the_picture(page, body, tmp_path) -> None:
+    circle = synthesize("circle", 8, 120, torch.Generator().manual_seed(1), body).scene
+    page.goto(save_html(circle, tmp_path / "a.html", body, styles=("skeleton",)).as_uri())
+    page.wait_for_function("window.player && player.drawn > 0")
+    toes = body.joints(circle)[0, 0, :, list(TOES)].flatten(0, 1).tolist()
+    page.evaluate("player.seek(0)")
+    page.evaluate("player.advance(0)")
+    lowest = page.evaluate("(toes) => Math.max(...toes.map((toe) => player.picture.onPage(toe)[1]))", toes)
+    assert lowest < page.evaluate("player.picture.canvas.clientHeight")
 
 
 def test_everybody_is_in_the_picture_of_a_phone_held_upright_or_turned(page, handshake, body, tmp_path) -> None:

@@ -41,7 +41,7 @@ class Marks {
     this.starts = new Uint32Array(meta.frames + 1); // the first mark of each frame
     for (const frame of arrays.mark_frames) this.starts[frame + 1]++;
     for (let frame = 0; frame < meta.frames; frame++) this.starts[frame + 1] += this.starts[frame];
-    this.any = this.places.length > 0;
+    this.kinds = new Set(this.facts.filter((_, fact) => fact % 4 === 1));
     const { gl } = picture;
     this.gl = gl;
     this.program = picture.program(MARK_VERTEX, MARK_FRAGMENT);
@@ -86,6 +86,14 @@ class Marks {
   colour(mark) {
     if (this.facts[4 * mark + 1] === DEEP) return this.depthColour(this.facts[4 * mark + 3] / 1000);
     return this.facts[4 * mark + 1] === FEET ? this.meta.amber : this.meta.hands;
+  }
+
+  // Words and ink (of CSS) of each kind of mark in this scene.
+  legend() {
+    const [amber, red, hands] = [this.meta.amber, this.meta.red, this.meta.hands].map((ink) => `rgb(${ink})`);
+    const [from, to] = [this.meta.from, this.meta.to].map((depth) => Math.round(100 * depth));
+    const deep = [`in each other, ${from} to ${to} cm and more`, `linear-gradient(90deg, ${amber}, ${red})`];
+    return [deep, ["hands touch", hands], ["feet slide", amber]].filter((_, kind) => this.kinds.has(kind));
   }
 
   // All marks of a frame in one call.

@@ -5,6 +5,8 @@ const ALL = -1; // takes, side by side
 const HEAD_HIGH = 2.3; // metres, where a take's label is
 const DEPTHS = 5; // pixels of the timeline's stripe of depths
 const FARTHEST = 80; // metres that the camera may be away
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const ZOOMS = { "+": 0.87, "=": 0.87, "-": 1.15, "_": 1.15 };
 const MOMENTS = 21; // at which is measured how much room people take
 
 // A stripe of the timeline: a background of CSS with a colour for each frame.
@@ -195,7 +197,8 @@ class Player {
   far() {
     const { clientWidth, clientHeight } = this.picture.canvas;
     const aspect = clientWidth / clientHeight || 1; // a folded frame has no size
-    return Math.min(Math.max(3.6, 2.2 * this.half, this.widest / (Math.tan(FIELD / 2) * aspect)), FARTHEST);
+    const feet = 1.1 + 1.92 * this.half; // of the nearest of a circle, from three quarters
+    return Math.min(Math.max(3.6, 2.2 * this.half, feet, this.widest / (Math.tan(FIELD / 2) * aspect)), FARTHEST);
   }
 
   // As near or far as somebody has zoomed, in a window of another shape.
@@ -245,6 +248,7 @@ class Player {
     get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
     const alone = meta.takes.length === 1 || this.view.take !== ALL;
     get("state").textContent = alone ? this.said(this.view.shown, this.view.take) : "";
+    get("time").ariaValueText = [get("clock").textContent, get("state").textContent].filter((text) => text).join(", ");
     for (const [take, label] of this.labels.entries()) {
       const people = alone ? [] : this.view.shown.filter((person) => person.take === take);
       const place = people.length && this.overhead(people);
@@ -300,9 +304,15 @@ class Player {
     get("style").addEventListener("change", (event) => (view.style = event.target.value));
     get("ghosts").hidden = !meta.people.some((person) => person.ghost);
     get("truth").addEventListener("change", (event) => (view.ghosts = event.target.checked));
-    get("marked").hidden = !this.picture.marks.any;
+    get("marked").hidden = !this.picture.marks.kinds.size;
+    for (const [words, ink] of this.picture.marks.legend()) {
+      const entry = get("legend").appendChild(document.createElement("span"));
+      entry.textContent = words;
+      entry.style.setProperty("--ink", ink);
+    }
     get("marks").addEventListener("change", (event) => {
       view.marks = event.target.checked;
+      get("legend").hidden = !view.marks;
       this.ribbon();
     });
     get("follow").addEventListener("change", (event) => (view.follow = event.target.checked));
@@ -310,9 +320,12 @@ class Player {
     window.addEventListener("resize", () => this.resized());
     document.addEventListener("keydown", (event) => {
       const { tagName, type } = event.target;
-      if (tagName === "SELECT") return;
+      if (tagName === "SELECT" || event.altKey || event.ctrlKey || event.metaKey) return; // the browser's own
       if (event.key === " " && (tagName === "BUTTON" || type === "checkbox")) return; // which it presses
+      const [dx, dy] = ARROWS[event.key] ?? [0, 0];
       if (event.key === " ") this.play(!this.playing);
+      else if (ZOOMS[event.key]) view.zoom(ZOOMS[event.key]);
+      else if (event.shiftKey && (dx || dy)) view.turn(15 * dx, 15 * dy);
       else if (event.key === "ArrowLeft") this.seek(this.frame - 1);
       else if (event.key === "ArrowRight") this.seek(this.frame + 1);
       else return;
