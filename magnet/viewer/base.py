@@ -256,6 +256,8 @@ class ViewerBase:
             frame = self.clock.frame
             shown = frame == self.shown and (self.clock.playing or frame == self.tracked)
             if shown or not self.views:
+                if self.views and self.server.get_clients().keys() - self.placed:  # somebody came while it stands still
+                    self._keep_in_sight(frame)
                 return
             jump = abs(frame - self.shown) > 5
             with self.server.atomic():

@@ -194,9 +194,10 @@ def test_people_stand_above_the_controls_of_a_phone_held_upright(body, monkeypat
     begin, middle = np.array([0.0, 0.85, 4.0]), np.array([0.0, 0.85, 0.0])
     camera = SimpleNamespace(position=begin, look_at=middle, fov=0.7, aspect=aspect, image_height=height)
     client = SimpleNamespace(client_id=0, camera=camera, atomic=viewer.server.atomic)
-    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: client})
     try:
         viewer.clock.seek(1)
+        viewer.draw()  # nobody looks yet, and the clock stands still
+        monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: client})
         viewer.draw()
     finally:
         viewer.stop()
