@@ -1,6 +1,8 @@
 """Training that goes on from what the model has made."""
 
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from magnet.body.floor import lowest
 from magnet.callbacks import RollOuts
 from magnet.callbacks.rollouts import eased, kinds_of, on_bodies, recorded_behind
 from magnet.generation.rollout import generate
-from magnet.motion.frames import canonical_frame
+from magnet.motion.frames import canonical_frame, from_planar, to_planar
 from magnet.motion.rotations import geodesic
 from magnet.motion.scene import Scene
 from magnet.synthesis import synthesize
@@ -153,6 +155,26 @@ def test_a_continuation_begins_where_the_past_ended_and_comes_back(frames: int):
     assert float(turned.mean()) < 0.3 * float(geodesic(past.body_rot[:, -1], behind.body_rot[:, 0]).mean())
 
 
+def test_poses_change_over_eight_frames_slowly_at_first_and_at_last():
+    scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
+    past, behind = scene.slice(0, 8), scene.slice(12)
+    joined, last = eased(past, behind, 24), past.body_rot[:, -1:]
+    gone = geodesic(last, joined.body_rot) / geodesic(last, behind.body_rot)
+    share = (torch.arange(1, 9) / 9) ** 2 * (3 - 2 * torch.arange(1, 9) / 9)
+    torch.testing.assert_close(gone[:, :8].mean(dim=(0, 2, 3)), share, atol=0.05, rtol=0)
+
+
+def test_people_turn_back_the_short_way():
+    """Ended at 172 degrees and recorded at -172: they turn by 16, not by 344."""
+    scene = random_scene(1, 40, 1, torch.Generator().manual_seed(0))
+    still = scene.frames_at(torch.zeros(40, dtype=torch.long))
+    yaw, _ = to_planar(canonical_frame(still.T_world_root[0, 0, 0]))
+    ways = [still.transformed(from_planar(angle - yaw, torch.zeros(2))) for angle in (3.0, -3.0)]
+    joined = eased(ways[0].slice(0, 8), ways[1].slice(8), 16)
+    there, _ = to_planar(canonical_frame(joined.T_world_root))
+    assert float(there.abs().min()) > 2.99
+
+
 def test_a_continuation_that_fits_stays_as_it_is():
     scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
     still = scene.frames_at(torch.zeros(48, dtype=torch.long))
@@ -247,6 +269,65 @@ def test_clips_are_kept_as_they_come_and_shared_by_several(made):
         for _ in range(4):
             rolling.keep(batch)
         assert len(rolling.kept) == 2 and all(each is batch for each in rolling.kept)
+
+
+def stubbed(monkeypatch, model) -> list[tuple[Scene, int, Scene]]:
+    """In place of samples, random motion: of which scene, how many frames more, and what was made."""
+    made: list[tuple[Scene, int, Scene]] = []
+
+    def generate(asked, start, task, context, more, samples, options, generator):
+        assert asked is model and not model.training and context == start.frames
+        whole = random_scene(start.scenes, context + more, 3, torch.Generator().manual_seed(len(made)), start.present)
+        made.append((start, more, whole))
+        return whole
+
+    monkeypatch.setattr("magnet.callbacks.rollouts.generate", generate)
+    monkeypatch.setattr("magnet.callbacks.rollouts.on_bodies", lambda behind, betas, body: behind)  # takes long
+    return made
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_whole_scenes_go_on_for_any_number_of_tokens_asked_for_and_their_ends_are_kept(made, monkeypatch, training):
+    batch, _, model = made
+    valid = torch.ones(12, FRAMES, dtype=torch.bool)
+    valid[0, 5] = False
+    asked = stubbed(monkeypatch, model)
+    rolling = RollOuts(scenes=2, frames=(30, 48), steps=1)
+    rolling.keep(batch)
+    model.train(training)
+    for seed in range(30):
+        pasts = rolling.rolled_out(model, batch.replace(valid=valid), torch.Generator().manual_seed(seed))
+        assert model.training == training
+        start, more, whole = asked[-1]
+        torch.testing.assert_close(start.T_world_root, batch.T_world_root[[1, 2], : FRAMES // 2])
+        torch.testing.assert_close(pasts.scenes.slice(0, FRAMES // 2).body_rot, whole.slice(more).body_rot)
+        assert pasts.share == rolling.share
+    assert {more for _, more, _ in asked} == {32, 36, 40, 44, 48}
+    model.train()
+
+
+def test_it_waits_for_four_times_as_many_clips_and_draws_anew_for_each_step_and_process(made, monkeypatch):
+    batch, _, model = made
+    seeds: dict[tuple[int, int], int] = {}
+
+    class Fit:
+        global_step, datamodule, precision_plugin = 0, None, SimpleNamespace(forward_context=nullcontext)
+
+    for rank, step in ((0, 0), (1, 0), (0, 5)):
+        rolling, waits = RollOuts(scenes=6, every=1), []
+
+        def rolled(model, batch, generator, precision, key=(rank, step)):
+            seeds[key] = generator.initial_seed()
+
+        monkeypatch.setattr(type(model), "global_rank", rank)
+        monkeypatch.setattr(rolling, "rolled_out", rolled)
+        monkeypatch.setattr(Fit, "global_step", step)
+        for number in range(4):
+            rolling.on_train_batch_start(Fit(), model, batch.select(torch.arange(6)), number)
+            waits.append((rank, step) in seeds)
+        assert waits == [False, False, False, True]
+    assert len(set(seeds.values())) == 3
+    model.made_pasts = None
 
 
 @pytest.mark.parametrize("wanted", [True, False])
