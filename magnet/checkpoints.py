@@ -256,13 +256,11 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
         )
     try:
         config = json.loads((folder / "config.json").read_bytes())
-        whole = config.get("sha256", own := config_hash(config)) == own
-        version, parts = int(config["format"]), [(part["file"], part["sha256"]) for part in config["parts"]]
-        kept = {name: config[name] for name in ("steps", *KEPT)}
-        if not isinstance(kept["hyper_parameters"], dict):
-            raise TypeError("it says no options of the model")
+        version, whole = int(config["format"]), config.get("sha256", own := config_hash(config)) == own
+        parts, kept = _listed(config) if version <= FORMAT else ([], {})  # a later format may hold anything else
     except (AttributeError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / 'config.json'} is damaged ({error}): fetch the release again") from error
+        said = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{folder / 'config.json'} is damaged ({said}): fetch the release again") from error
     if version > FORMAT:
         raise ValueError(f"{folder}: weights format {version}, this version reads up to {FORMAT}")
     if not whole:
@@ -287,6 +285,23 @@ def _read_folder(folder: Path, halves: bool) -> dict[str, Any]:
     return renamed_checkpoint(checkpoint)
 
 
+def _listed(config: dict[str, Any]) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+    """Files and hashes of a release, and its step and options; raises where a config.json does not hold them."""
+    kept = {name: config[name] for name in ("steps", *KEPT)}
+    if not isinstance(kept["hyper_parameters"], dict):
+        raise TypeError("it says no options of the model")
+    return [(part["file"], part["sha256"]) for part in config["parts"]], kept
+
+
+def is_released(folder: Path) -> bool:
+    """Whether a folder's config.json is that of a released model, whole or not; other programs call theirs so, too."""
+    try:
+        config = json.loads((folder / "config.json").read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(config, dict) and {"format", "parts", *KEPT} <= config.keys()
+
+
 def config_hash(config: dict[str, Any]) -> str:
     """SHA-256 of a config.json without this hash itself."""
     said = json.dumps({key: value for key, value in config.items() if key != "sha256"}, sort_keys=True)
@@ -304,6 +319,7 @@ def write(checkpoint: dict[str, Any], folder: Path, about: dict[str, Any] | None
 
     Raises:
         CannotWrite: the disk is full, or the folder may not be written to.
+        ValueError: a weight is NaN, or too large for float16; what was there before stays.
     """
     folder.mkdir(parents=True, exist_ok=True)
     advice = "choose another folder"
@@ -337,8 +353,12 @@ def _in_parts(state: dict[str, Tensor], half: bool) -> list[dict[str, Tensor]]:
     parts: list[dict[str, Tensor]] = [{}]
     size = 0
     for name, value in state.items():
+        before = value
         if half and value.is_floating_point() and value.dim() > 1 and not any(part in name for part in exact):
             value = value.half()
+        if value.isnan().any() or (value.isinf() & ~before.isinf()).any():
+            largest = f"up to {float(before.abs().max()):.3g}, which float16 does not hold"
+            raise ValueError(f"{name}: holds {'NaN' if before.isnan().any() else largest}; take another checkpoint")
         weight = value.numel() * value.element_size()
         if parts[-1] and size + weight > PART_BYTES:
             parts.append({})

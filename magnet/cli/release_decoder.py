@@ -41,7 +41,7 @@ def with_decoder(checkpoint: dict[str, Any], tokenizer: dict[str, Any]) -> dict[
 def decoder_kept(state: dict[str, Tensor], replaced: Path) -> dict[str, Any]:
     """The record of the decoder's run in a released folder, where its decoder is the checkpoint's; else nothing."""
     said = replaced / "config.json"
-    record = json.loads(said.read_text(encoding="utf-8"))["about"].get("decoder run") if said.is_file() else None
+    record = (json.loads(said.read_bytes()).get("about") or {}).get("decoder run") if said.is_file() else None
     if record is None:
         return {}
     before = checkpoints.read(replaced)["state_dict"]

@@ -231,6 +231,16 @@ def in_words_of(source: dict[str, Any]) -> str:
     return f"{source['name']}{digest}, trained on: {data}{part}{licence}"
 
 
+def same_card(folder: Path) -> bool:
+    """Whether a released folder's README.md is what `card` says of it, so that nobody has written another."""
+    try:
+        record = json.loads((folder / "config.json").read_bytes())["about"]
+        size = sum(part.stat().st_size for part in folder.glob("*.safetensors"))
+        return (folder / "README.md").read_text(encoding="utf-8") == card(folder.resolve().name, record, size)
+    except (OSError, ValueError, KeyError, TypeError):  # another card, or the record of another program
+        return False
+
+
 def card(name: str, record: dict[str, Any], size: int) -> str:
     """README.md of a released model, for whoever it is passed on to; its maker may write a better one."""
     rows = [("trained on", in_words(record["trained on"]))]

@@ -259,10 +259,51 @@ def test_a_name_is_no_path_and_other_files_and_cards_are_left(tuned: Path, capsy
     Path("mine/README.md").write_text("a better card")
     assert cli.main(["release", str(tuned), "mine", *SAID]) == 0
     assert Path("mine/README.md").read_text() == "a better card"
+    assert "mine/README.md is left as it was" in capsys.readouterr().err
     assert cli.main(["release", str(tuned), "mine", *SAID, "--folder", "full/thesis.txt"]) == 2
     assert "thesis.txt is a file, expected a folder" in capsys.readouterr().err
     assert cli.main(["release", "mine", "again", *SAID]) == 2
     assert "a released model already" in capsys.readouterr().err
+
+
+def test_a_card_that_magnet_wrote_says_what_the_newest_release_says(
+    tuned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    card = Path("mine/README.md")
+    assert cli.main(["release", str(tuned), "mine", *SAID]) == 0
+    assert "CC-BY-4.0" in card.read_text(encoding="utf-8")
+    assert cli.main(["release", str(tuned), "mine", "--trained_on", "other duets", "--licence", "MIT"]) == 0
+    text = card.read_text(encoding="utf-8")
+    assert "| licence | MIT |" in text and "other duets" in text and "CC-BY-4.0" not in text
+    assert "left as it was" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "not json", '{"format": 1, "architectures": ["Bert"]}'])
+def test_the_model_of_another_program_is_left(content: str, tuned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine").mkdir()
+    Path("mine/config.json").write_text(content)
+    assert cli.main(["release", str(tuned), "mine", *SAID]) == 2
+    assert "mine is a folder of other files; choose another name" in capsys.readouterr().err
+    assert [file.name for file in Path("mine").iterdir()] == ["config.json"]
+    assert Path("mine/config.json").read_text() == content
+
+
+def test_a_release_whose_record_is_empty_is_replaced(tuned: Path) -> None:
+    checkpoints.write(checkpoints.read(tuned / "checkpoints" / "last.ckpt"), Path("mine"))
+    config = json.loads(Path("mine/config.json").read_text()) | {"about": None}
+    Path("mine/config.json").write_text(json.dumps(config))
+    assert cli.main(["release", str(tuned), "mine", *SAID]) == 0
+    assert about(Path("mine"))["licence"] == "CC-BY-4.0"
+
+
+def test_a_name_that_would_load_the_packages_own_model_is_refused(
+    tuned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["release", str(tuned), "duet", *SAID]) == 2
+    assert "duet is a model of the package, and would be loaded by that name" in capsys.readouterr().err
+    assert not Path("duet").exists()
+    assert cli.main(["release", str(tuned), "duet", *SAID, "--folder", "models"]) == 0
+    assert checkpoints.resolve("models/duet") == Path("models/duet")
 
 
 @pytest.fixture

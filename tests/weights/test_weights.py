@@ -108,9 +108,28 @@ def test_a_later_format_is_refused(checkpoint, tmp_path):
     (folder / "config.json").write_text(json.dumps({**config, "format": 99}))
     with pytest.raises(ValueError, match="format 99"):
         checkpoints.read(folder)
+    (folder / "config.json").write_text(json.dumps({"format": 99, "files": {}}))  # it may hold anything else
+    with pytest.raises(ValueError, match="weights format 99, this version reads up to 1"):
+        checkpoints.read(folder)
 
 
-@pytest.mark.parametrize("change", [{"format": "one"}, {"hyper_parameters": None}, {"parts": 3}])
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(float("nan"), "big: holds NaN"), (7e4, r"big: holds up to 7e\+04, which float16 does not hold")],
+)
+def test_weights_that_are_no_numbers_in_a_release_are_refused(value, said, checkpoint, tmp_path):
+    folder = checkpoints.write(checkpoint, tmp_path)
+    before = (folder / "config.json").read_bytes()
+    checkpoint["state_dict"]["big"] = torch.full((2, 3), 0.5)
+    checkpoint["state_dict"]["big"][1, 2] = value
+    with pytest.raises(ValueError, match=said):
+        checkpoints.write(checkpoint, folder)
+    assert (folder / "config.json").read_bytes() == before
+    checkpoint["state_dict"]["big"] = torch.full((2, 3), -float("inf"))  # a mask's own
+    assert bool(checkpoints.read(checkpoints.write(checkpoint, folder))["state_dict"]["big"].isinf().all())
+
+
+@pytest.mark.parametrize("change", [{"format": "one"}, {"hyper_parameters": None}, {"parts": 3}, {"parts": [{}]}])
 def test_a_damaged_configuration_is_named(change, checkpoint, tmp_path):
     folder = checkpoints.write(checkpoint, tmp_path)
     config = json.loads((folder / "config.json").read_text())
