@@ -12,7 +12,8 @@ import yaml
 from magnet import checkpoints, cli
 from magnet.denoiser.module import Denoiser
 from magnet.denoiser.starting import tokenizer_of
-from magnet.testing import tiny_denoiser
+from magnet.denoiser.statistics import pairwise_ground
+from magnet.testing import random_scene, tiny_denoiser
 from magnet.tokenizer.checkpoint import shaping
 from magnet.tokenizer.module import RawPose, Tokenizer
 
@@ -61,6 +62,31 @@ def test_with_another_tokenizer_tokens_are_normalised_anew(tmp_path: Path) -> No
     before = second.normalizer.mean.clone()
     second.take_over(path)
     assert torch.equal(second.normalizer.mean, before)
+
+
+def answered(model: Denoiser) -> torch.Tensor:
+    """What a model makes of the same motion, in metres."""
+    generator = torch.Generator().manual_seed(3)
+    scene = random_scene(2, 32, 3, generator)
+    tokens, levels = model.tokenize(scene)[0], torch.randint(0, 1001, (2, 8, 3), generator=generator)
+    with torch.no_grad():
+        made = model.denoise(model.normalizer.normalize(tokens), levels, scene.present)
+    return model.normalizer.denormalize(made)
+
+
+def test_with_another_scale_of_pairs_or_a_condition_it_begins_as_the_same_model(tmp_path: Path) -> None:
+    first = tiny_denoiser(seed=1)
+    with torch.no_grad():
+        for weight in first.transformer.parameters():  # biases and norms too
+            weight.normal_(std=0.1)
+    path = saved(first, tmp_path / "first.ckpt")
+    for other in ({"noise": {"pairwise_metres": 0.5}}, {"network": {"cond_dim": 4}}, {}):
+        second = tiny_denoiser(seed=1, **other)
+        second.take_over(path)
+        torch.testing.assert_close(answered(second), answered(first), rtol=1e-4, atol=1e-4)
+        ground = pairwise_ground(first.layout)
+        expected = torch.where(ground, 0.5, first.normalizer.std) if "noise" in other else first.normalizer.std
+        assert torch.equal(second.normalizer.std, expected)
 
 
 def test_a_denoiser_of_raw_poses_is_started_from_as_well(tmp_path: Path) -> None:
