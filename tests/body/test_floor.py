@@ -88,6 +88,24 @@ def test_a_quarter_of_a_metre_is_off_the_floor_and_in_a_leap_ninety_centimetres(
     assert away(0.5, 8) == 0.0
 
 
+def test_of_people_who_are_all_off_the_floor_the_one_nearest_to_it_says_how_far():
+    low = torch.tensor([[0.5, 1.0, torch.nan], [-1.0, -0.5, torch.nan]])[:, None].expand(2, 40, 3)
+    assert off_floor(low, low.isfinite()).tolist() == [0.5, -0.5]
+    assert off_floor(low[:, :0], low[:, :0].isfinite()).tolist() == [0.0, 0.0]
+
+
+def test_the_scene_farthest_from_the_floor_is_told_over_it_or_under():
+    over, under = (lifted(still([0, 0, 0], 0.93), metres) for metres in (0.5, -0.8))
+    both = torch.cat([over.T_world_root, under.T_world_root])
+    assert level(over.repeat(2).replace(T_world_root=both)) == pytest.approx(-0.8, abs=0.02)
+    assert level(over.repeat(2).replace(T_world_root=both[[0, 0]])) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_free_slot_does_not_keep_the_others_off_the_floor():
+    scene = lifted(still([0, 0, 0], 0.93), 0.5).pad_agents(2)
+    assert float(lowest(on_floor(scene))[..., 0].abs().max()) < 0.02
+
+
 def test_a_glitch_or_two_do_not_say_where_somebody_stands():
     low = torch.full((1, 100, 1), 0.02)
     low[:, :3] = -2.0
@@ -211,4 +229,4 @@ def test_whoever_stands_off_the_floor_of_the_others_is_named_with_centimetres() 
     near, over, under = off_their_floor([0.04, 0.09, -0.2]), off_their_floor([0.0, 0.09], ("A", "B")), [-0.2, math.nan]
     assert [text.split(":")[0] for text in near] == ["person 1", "person 2"]
     assert over[0].startswith("B: stands 9 cm over the scene's floor") and len(over) == 1
-    assert "20 cm under" in off_their_floor(under)[0] and len(off_their_floor(under)) == 1
+    assert "stands 20 cm under" in off_their_floor(under)[0] and len(off_their_floor(under)) == 1
