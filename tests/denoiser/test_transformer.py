@@ -1,3 +1,4 @@
+import math
 from unittest import mock
 
 import pytest
@@ -24,6 +25,82 @@ def batch(generator: torch.Generator, layout: TokenLayout = LAYOUT):
     noisy = torch.randn(2, 6, layout.agents, layout.width, generator=generator)
     levels = torch.randint(LEVELS + 1, (2, 6, layout.agents), generator=generator)
     return noisy, levels
+
+
+def waves(value: float, width: int) -> list[float]:
+    angles = [value * 10_000 ** (-2 * k / width) for k in range(width // 2)]
+    return [math.sin(angle) for angle in angles] + [math.cos(angle) for angle in angles]
+
+
+def turned(x: torch.Tensor, time: int) -> torch.Tensor:
+    """Numbers d and d + half of them as a complex one, turned by an angle that is smaller the larger d. (D,)"""
+    half = len(x) // 2
+    pairs = torch.complex(x[:half], x[half:])
+    angles = torch.tensor([time * 10_000 ** (-d / half) for d in range(half)], dtype=x.dtype)
+    whole = pairs * torch.polar(torch.ones_like(angles), angles)
+    return torch.cat([whole.real, whole.imag])
+
+
+def written_out(model: Transformer, noisy: torch.Tensor, levels: torch.Tensor, cond: torch.Tensor | None):
+    """The network token by token and head by head, of one scene of people who are all there. (N, P, D) -> same"""
+    o, (N, P) = model.options, levels.shape
+    groups = model.layout.group_levels(levels[None])[0]  # (N, P, 1 + slots)
+    rows, times = [], []
+    for n in range(N):
+        for p in range(P):
+            own, *pairs = groups[n, p].tolist()
+            told = waves(own, o.level_width) + [wave for level in pairs for wave in waves(level, o.slot_width)]
+            agent = [] if model.agent is None else [model.agent[p]]
+            rows.append(torch.cat([noisy[n, p], torch.tensor(told, dtype=noisy.dtype), *agent]))
+            times.append(n)
+    x = model.in_proj(torch.stack(rows))
+    if o.cond_dim:
+        known = [cond is not None and bool(cond[n].isfinite().all()) for n in times]
+        x = x + torch.stack(
+            [model.cond_proj(cond[n]) if k else model.no_cond for n, k in zip(times, known, strict=True)]
+        )
+    if o.rope == "hidden":
+        x = x + torch.stack([turned(row, n) for row, n in zip(x, times, strict=True)])
+    each = o.width // o.heads
+    for block in model.blocks:
+        query, key, value = block.qkv(x).split(o.width, dim=1)
+        made = []
+        for head in range(o.heads):
+            q, k, v = (part[:, head * each : (head + 1) * each] for part in (query, key, value))
+            if o.rope == "heads":
+                q, k = (torch.stack([turned(row, n) for row, n in zip(part, times, strict=True)]) for part in (q, k))
+            made.append((q @ k.T / math.sqrt(each)).softmax(dim=1) @ v)
+        x = block.norm_attention(x + block.out(torch.cat(made, dim=1)))
+        x = block.norm_mlp(x + block.mlp(x))
+    return model.out_proj(x).view(N, P, -1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"rope": "hidden"}, {"rope": "none", "agent_embedding": False}, {"rope": "heads", "cond_dim": 3}],
+    ids=str,
+)
+@torch.no_grad()
+def test_the_network_is_what_is_written_out(options, generator):
+    """Post-norm encoder blocks over all tokens of a scene; levels and times as waves of 1 to 10,000 over 2 pi."""
+    model = build(dropout=0.1, **options).double()
+    for weight in model.parameters():
+        weight.normal_(std=0.3, generator=generator)
+    noisy, levels = batch(generator)
+    noisy, cond = noisy.double(), torch.randn(2, 6, 3, generator=generator, dtype=torch.float64)
+    cond[0, 2, 1] = cond[1, 4] = torch.nan
+    for given in (cond, None) if options.get("cond_dim") else (None,):
+        made = model(noisy, levels, torch.ones(2, 4, dtype=torch.bool), given)
+        for scene in range(2):
+            expected = written_out(model, noisy[scene], levels[scene], None if given is None else given[scene])
+            torch.testing.assert_close(made[scene], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_condition_says_nothing_before_it_is_learnt(generator):
+    """So training with one begins as the model that it starts from."""
+    model, (noisy, levels) = build(cond_dim=3), batch(generator)
+    present = torch.ones(2, 4, dtype=torch.bool)
+    assert torch.equal(model(noisy, levels, present, torch.ones(2, 3)), model(noisy, levels, present))
 
 
 @pytest.mark.parametrize("options", [{}, {"causal_block": 2}, {"rope": "hidden"}], ids=["plain", "causal", "hidden"])
@@ -156,8 +233,9 @@ def test_one_person_alone_is_a_scene(generator):
 
 
 def test_heads_must_divide_the_width():
-    with pytest.raises(ValueError, match="width 30 must be a multiple"):
-        build(width=30, heads=4)
+    for width in (30, 36):
+        with pytest.raises(ValueError, match=f"width {width} must be a multiple of twice the 4 heads"):
+            build(width=width, heads=4)
 
 
 # -- attention in causal blocks ------------------------------------------------------------------
