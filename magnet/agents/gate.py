@@ -43,6 +43,8 @@ class Gate:
     Attributes:
         taken: how many were.
         refused: how many were not, by the reason.
+        reason: why the last one was not; empty: it was.
+        strangers: who told tokens of other weights.
         passed_over: how many were right in form and of no use here: what somebody else who comes back is told of its
             own past, and what oneself is told of a past that is long over.
         now: own frame, about which frames of others are taken; None: any.
@@ -55,6 +57,7 @@ class Gate:
         self.names, self.me, self.model, self.latent = tuple(names), me, model, latent
         self.rate, self.burst = rate, burst
         self.taken, self.passed_over, self.refused = 0, 0, Counter[str]()
+        self.reason, self.strangers = "", set[str]()
         self.now: int | None = None
         self.due = 0
         self._sessions: dict[str, tuple[int, float]] = {}  # whose newest process that is, and when it was last heard
@@ -70,6 +73,7 @@ class Gate:
             at: now, in seconds of any clock that does not go back.
             peer: who is known to be at the other end; None: not known.
         """
+        self.reason = ""
         try:
             message = unpack(parts)
             self._sent_by(message, at, peer)
@@ -77,10 +81,12 @@ class Gate:
                 self.passed_over += 1
                 return None
             if message.model != self.model:  # who has other weights does not understand it
+                self.strangers |= {message.sender} if message.model and self.model else set()
                 message = replace(message, model="", token=None)
             self._numbers(message)
         except RefusedMessage as reason:
-            self.refused[str(reason)] += 1
+            self.reason = str(reason)
+            self.refused[self.reason] += 1
             return None
         self._sessions[message.sender] = message.session, at
         self._note(message)

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from magnet.agents.agent import PAST, Member
 from magnet.agents.gate import GONE, Gate
 from magnet.agents.message import TOKEN, Message, pack
+from magnet.agents.news import News
 from magnet.motion.scene import FPS
 
 PERIOD = TOKEN / FPS
@@ -166,6 +167,7 @@ class Process:
         clock: seconds of a clock that does not go back.
         speed: seconds of the scene in a second of the clock, the same for all: less than 1 where processors are slow.
         kept: called with each own message.
+        say: told in a line what happens.
     """
 
     def __init__(
@@ -181,6 +183,7 @@ class Process:
         clock: Callable[[], float] = time.monotonic,
         kept: Callable[[Message], object] = lambda _: None,
         speed: float = 1.0,
+        say: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.member, self.link, self.gate, self.others = member, link, gate, others
         self.real_time, self.patience, self.meet, self.kept = real_time, speed * patience, speed * meet, kept
@@ -188,7 +191,7 @@ class Process:
         self.session = time.time_ns() if session is None else session
         self.name = member.names[member.me]
         self.pace: Pace | None = None
-        self.report = Report(speed=speed)
+        self.report, self.news = Report(speed=speed), News(say)
         self._heard: set[str] = set()
         self._heard_by: set[str] = set()
         self._running: dict[str, float] = {}  # who tells its frames, and when it last did
@@ -200,6 +203,8 @@ class Process:
             at = self.clock()
             message = self.gate.take(parts, at, peer)
             if message is None:
+                if self.gate.reason:
+                    self.news.refused(peer, self.gate.reason)
                 continue
             self._heard.add(message.sender)
             if message.kind == "hello":
@@ -209,14 +214,24 @@ class Process:
                     self._answer(message, at)
                 continue
             if message.agent == message.sender:
-                self._running[message.sender] = at
-                slot, index = self.member.names.index(message.sender), message.frame // TOKEN
-                again = self.member.come(slot, index)  # as somebody is told who comes back, and all hear
-                self.member.hear(message)
-                if self.pace is not None and not again:
-                    self.pace.heard(message.sender, index, at, message.lags.get(self.name))
+                self._hear(message, at)
             elif self.pace is None:  # who has begun knows better where it is than others do
                 self.member.hear(message)
+
+    def _hear(self, message: Message, at: float) -> None:
+        """Frames of who tells them."""
+        member, name, index = self.member, message.sender, message.frame // TOKEN
+        slot = member.names.index(name)
+        self._running[name] = at
+        self.news.heard(name)
+        if name in self.gate.strangers:
+            self.news.of_other_weights(name)
+        if message.frame == 0 and member.come(slot, -1):
+            self.news.first_frame(name, message.poses[0], member.pieces[slot][-1].poses[-1])
+        again = member.come(slot, index)  # as somebody is told who comes back, and all hear
+        member.hear(message)
+        if self.pace is not None and not again:
+            self.pace.heard(name, index, at, message.lags.get(self.name))
 
     def _answer(self, hello: Message, at: float) -> None:
         """Tell somebody who has come back how things are, at most every two seconds."""
@@ -256,6 +271,8 @@ class Process:
                 member.join(there + 1)
                 self.report.joined = member.next
         self.pace = Pace(self.clock() + PERIOD, member.next)
+        deaf = set() if self._running else self._heard - self._heard_by  # who has begun says no hello
+        self.news.begins(self._heard, self.unheard, deaf, PERIOD * member.next if self.report.joined else None)
 
     def _there(self) -> int:
         """The newest token that two have come to, of the others and the own clock; where one other tells, its own.
@@ -290,7 +307,9 @@ class Process:
         """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
         member, pace, cost = self.member, self.pace, self.report.cost()
         assert pace is not None
-        if self.real_time and ((there := self._there()) - member.next) * PERIOD > LOST:
+        self.news.look(self._running, self.clock())
+        if self.real_time and (behind := ((there := self._there()) - member.next) * PERIOD) > LOST:
+            self.news.jumped(behind, self.clock())
             member.join(there + 1)  # too slow for them all the time, or stopped for a while
             pace = self.pace = Pace(self.clock() + PERIOD, member.next)
             self.report.jumps += 1

@@ -21,6 +21,7 @@ AGAIN = 0.25
 """Seconds after which whoever ZeroMQ has closed the connection to, and does not connect to again, is."""
 THREADS = 32
 """Threads of ZeroMQ, at most."""
+FORM = re.compile(r"ipc://.+|inproc://.+|tcp://[^\s/]+:(\d+|\*)")
 HERE = re.compile(r"ipc://.+|inproc://.+|tcp://(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+")
 
 
@@ -97,6 +98,9 @@ class Link:
                         "(--keys) to send to others"
                     )
         else:
+            for address in (listen, *connect.values()):
+                if not FORM.fullmatch(address):
+                    raise ValueError(f"{address} is not an address: expected tcp://HOST:PORT or ipc://PATH")
             for file in (f"{name}.key_secret", *(f"{other}.key" for other in connect)):
                 if not (keys / file).is_file():
                     raise ValueError(f"{keys / file} is missing: make one with --make_keys, or copy theirs there")

@@ -187,6 +187,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
         given.meet,
         kept=told.append if given.out else lambda _: None,
         speed=given.speed,
+        say=link.say,
     )
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):  # also where a shell began it in the background, ignoring them

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
@@ -64,6 +65,15 @@ def test_with_keys_members_hear_each_other_and_strangers_hear_nothing(tmp_path):
     assert stranger.receive(0.2) == [] and plain.receive(0.1) == []
     for link in (one, two, stranger, plain):
         link.close()
+
+
+@pytest.mark.parametrize("address", ["tcp://10.0.0.1", "tcp://bad host:5602", "udp://10.0.0.1:5602", "robot:5602"])
+def test_what_is_not_an_address_is_named_and_not_the_one_beside_it(address: str, tmp_path: Path) -> None:
+    for name in "AB":
+        make_keys(tmp_path, name)
+    for listen, connect in ((address, "tcp://10.0.0.2:5602"), (addresses_of("A")["A"], address)):
+        with pytest.raises(ValueError, match=f"^{re.escape(address)} is not an address: expected tcp://HOST:PORT"):
+            Link("A", listen, {"B": connect}, tmp_path)
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
