@@ -27,7 +27,7 @@ from magnet.generation.unmade import completed, given_invalid
 from magnet.motion.required import require_rate
 from magnet.motion.scene import FPS, Scene
 from magnet.motion.tokens import TOKEN_FRAMES
-from magnet.precision import device_of
+from magnet.precision import cpu_by_default, device_of
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks.base import Task, task_of
 from magnet.tasks.inbetweening import Inbetweening
@@ -35,6 +35,7 @@ from magnet.tasks.inbetweening import Inbetweening
 __all__ = ["Model", "Motion", "NotebookView", "load", "read"]
 
 
+@cpu_by_default
 def load(
     name_or_path: str | Path | None = None,
     *,
@@ -68,6 +69,7 @@ def load(
     return Model(DenoiserCore.load(name_or_path).to(place), options)
 
 
+@cpu_by_default
 def read(
     *paths: str | Path | Iterable[str | Path],
     body: str | Path | Body | None = None,
@@ -138,6 +140,7 @@ class Model:
     def most_people(self) -> int:
         return self.denoiser.layout.agents
 
+    @cpu_by_default
     def generate(
         self,
         people: int = 2,
@@ -166,6 +169,7 @@ class Model:
             scene = Motion.of(scene.replace(body=given.id), given)
         return self.predict(scene, "generation", context=0, frames=frames, **said)
 
+    @cpu_by_default
     def start_crowd(
         self, people: int, groups: Scene | Sequence[Scene] = (), spacing: float = SPACING, *, seed: int | None = None
     ) -> Motion:
@@ -202,6 +206,7 @@ class Model:
         said: dict[str, Any] = {"seed": seed, "samples": samples, "cond": cond}
         return self.predict(scene, "joint_future", context=given, frames=frames, **said)
 
+    @cpu_by_default
     def inpaint(
         self,
         scene: Scene,
@@ -257,6 +262,7 @@ class Model:
         fields: dict[str, Any] = {"target": slots_of("agent", agent, scene.agents), "block": block}
         return self.predict(scene, "motion_control", context=context, seed=seed, samples=samples, **fields)
 
+    @cpu_by_default
     def partner(
         self, past: Scene, agents: int | Sequence[int] = 0, *, block: int = 1, seed: int | None = None
     ) -> LivePartner:
@@ -279,6 +285,7 @@ class Model:
         partner.model = body
         return partner
 
+    @cpu_by_default
     def predict(
         self,
         scene: Scene,
@@ -326,6 +333,7 @@ class Model:
         made = self.sample(scene, chosen, context, frames, seed=seed, samples=samples, cond=cond)
         return Motion.of(completed(made.plain(), plain.to("cpu"), plan.known, ~plan.finished), body)
 
+    @cpu_by_default
     def sample(
         self,
         scene: Scene,

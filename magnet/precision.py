@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Self
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, ParamSpec, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+Args = ParamSpec("Args")
+Made = TypeVar("Made")
 
 
 class Float32(nn.Module):
@@ -59,6 +64,38 @@ def device_of(device: str | torch.device) -> torch.device:
     if place.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {device}: torch can use none on this machine; cpu always works")
     return place
+
+
+def _cpu() -> AbstractContextManager[Any]:
+    return nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu")
+
+
+def cpu_by_default(run: Callable[Args, Made]) -> Callable[Args, Made]:
+    """A function in which tensors without a device are on the CPU, also where `torch.set_default_device` was called."""
+
+    @functools.wraps(run)
+    def on_cpu(*args: Args.args, **kwargs: Args.kwargs) -> Made:
+        with _cpu():
+            return run(*args, **kwargs)
+
+    return on_cpu
+
+
+def each_cpu_by_default(run: Callable[Args, Iterator[Made]]) -> Callable[Args, Iterator[Made]]:
+    """`cpu_by_default` for generators: between two values the caller's default counts."""
+
+    @functools.wraps(run)
+    def on_cpu(*args: Args.args, **kwargs: Args.kwargs) -> Iterator[Made]:
+        values = run(*args, **kwargs)
+        while True:
+            with _cpu():
+                try:
+                    value = next(values)
+                except StopIteration:
+                    return
+            yield value
+
+    return on_cpu
 
 
 APPLE = "torch has no float64 on Apple's GPUs, in which places on the floor are computed; take cpu"

@@ -12,11 +12,12 @@ import torch
 from torch.utils.data import DataLoader
 
 import magnet
-from magnet.api import Model
+from magnet.api import Model, Motion
 from magnet.body import load_body
 from magnet.denoiser.module import Denoiser
 from magnet.export import save_bvh
-from magnet.generation.rollout import generate
+from magnet.generation.live import Live
+from magnet.generation.rollout import generate, stream
 from magnet.motion.scene import Scene
 from magnet.precision import Float32, accelerator_of, device_of, quick_precision
 from magnet.sampling.guidance import Guidance
@@ -151,6 +152,42 @@ def test_another_default_dtype_of_torch_changes_nothing(tmp_path: Path, request:
     for was, now in zip(before, made_by(model, duet, bvh), strict=True):
         for name, value in now.tensors().items():
             assert value.dtype == getattr(was, name).dtype and torch.equal(value, getattr(was, name)), name
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[None]:
+    torch.set_default_device("meta")  # of which nobody can read a number
+    yield
+    torch.set_default_device(None)
+
+
+def test_another_default_device_of_torch_changes_nothing(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    model = Model(tiny_denoiser(max_agents=3), SamplerOptions(steps=2, settle="hold"))
+    duet = random_scene(1, 24, 2, torch.Generator().manual_seed(5))
+    bvh = save_bvh(duet, tmp_path / "a.bvh", load_body())
+    before = made_by(model, duet, bvh)
+    request.getfixturevalue("elsewhere")
+    loaded = magnet.load("duet", steps=1).denoiser
+    assert {value.device.type for value in (*loaded.parameters(), *loaded.buffers())} == {"cpu"}
+    live = Live(model, people=2)
+    live.settings.steps = 2
+    assert live.advance().frames and live.scene.device.type == "cpu"
+    for was, now in zip(before, made_by(model, duet, bvh), strict=True):
+        assert all(torch.equal(value, getattr(was, name)) for name, value in now.tensors().items())
+        assert torch.equal(Motion.of(now).on_floor().joints(), Motion.of(was).on_floor().joints())
+    for suffix in (".npz", ".bvh", ".glb", ".csv", ".html"):
+        assert Motion.of(duet).save(tmp_path / f"b{suffix}").exists()
+
+
+def test_between_two_chunks_the_default_device_is_the_callers(elsewhere: None) -> None:
+    with torch.device("cpu"):
+        model, duet = tiny_denoiser(), random_scene(1, 16, 2, torch.Generator().manual_seed(5))
+    chunks = stream(model, duet, registry.get("joint_future")(), 16, 16, options=SamplerOptions(steps=1), chunk=2)
+    made = []
+    for chunk in chunks:
+        assert torch.zeros(1).device.type == "meta"
+        made.append(chunk.T_world_root.device.type)
+    assert len(made) > 1 and set(made) == {"cpu"}
 
 
 def test_apples_gpu_which_has_no_float64_is_not_taken_by_itself_and_refused_if_asked_for(monkeypatch) -> None:

@@ -23,6 +23,7 @@ from magnet.body.joints import PARENTS
 from magnet.body.pickles import pickled_arrays
 from magnet.files import DAMAGED, load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.precision import cpu_by_default
 
 SHAPES = 10
 """Shape numbers of a body; a file may have more, which are ignored."""
@@ -201,6 +202,7 @@ def _blend(directions: Tensor, amounts: Tensor) -> Tensor:
 # -- reading a file ----------------------------------------------------------------------------
 
 
+@cpu_by_default
 def load_body(which: str | Path = "open") -> Body:
     """The open body that ships with the package ("open"), or one from a file of SMPL, SMPL-H or SMPL-X: npz or pkl.
 

@@ -12,6 +12,7 @@ from magnet.body.base import Body, load_body
 from magnet.body.fit import clearance
 from magnet.body.joints import FEET
 from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.precision import cpu_by_default
 
 SKIN = 0.03
 """Metres between the floor that somebody lies on and a joint that is not of the feet."""
@@ -80,6 +81,7 @@ def counting(scene: Scene) -> Tensor:
     return counts if scene.valid is None else counts & scene.valid[..., None]
 
 
+@cpu_by_default
 def on_floor(scene: Scene, body: Body | None = None) -> Scene:
     """The same motion, each scene moved so that its lowest person stands on y = 0; masked frames do not count.
 

@@ -19,6 +19,7 @@ from magnet.denoiser.transformer import FEW_SLOTS
 from magnet.errors import warn_user
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, TokenLayout, scene_transforms
+from magnet.precision import cpu_by_default
 from magnet.shared import digest, is_sharing, once
 from magnet.tokenizer.base import PoseTokenizer
 from magnet.tokenizer.core import TokenizerCore
@@ -135,6 +136,7 @@ class TokenModelCore(nn.Module):
             self.to(self.device)
 
     @classmethod
+    @cpu_by_default
     def load(cls, name_or_path: str | Path | None = None) -> Self:
         """A trained model ready for use: one that comes with the package by name, or a checkpoint's path.
 

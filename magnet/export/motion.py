@@ -19,6 +19,7 @@ from magnet.errors import warn_user
 from magnet.export import formats
 from magnet.files import suffixed, whole
 from magnet.motion.scene import Scene
+from magnet.precision import cpu_by_default
 
 Player = Literal["page", "film"]
 OPTIONS = tuple(
@@ -45,18 +46,22 @@ class Motion(Scene):
         tensors = self.tensors()
         return Scene(**tensors, fps=self.fps, body=self.body, names=self.names)
 
+    @cpu_by_default
     def joints(self) -> Tensor:
         """World joints of everybody. -> (B, T, P, 22, 3) metres"""
         return self._body().joints(self)
 
+    @cpu_by_default
     def vertices(self) -> Tensor:
         """World vertices of everybody. -> (B, T, P, V, 3) metres"""
         return self._body().vertices(self)
 
+    @cpu_by_default
     def on_floor(self) -> Motion:
         """The same motion with the lowest standing person on y = 0, the models' floor; for each scene separately."""
         return Motion.of(on_floor(self.plain(), self._body()), self.model, self.notes)
 
+    @cpu_by_default
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write the format of the path's suffix: .npz .bvh .glb .vrma .csv .html .mp4 .gif .webp .png.
 

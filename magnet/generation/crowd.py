@@ -29,6 +29,7 @@ from magnet.motion.neighbours import CrowdLayout, CrowdViews, nearest_partners
 from magnet.motion.placement import place
 from magnet.motion.scene import Scene, cat_time, concatenate
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token
+from magnet.precision import cpu_by_default
 from magnet.sampling.noise import add_noise
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Stage, initial_levels
@@ -48,6 +49,7 @@ MOST_HIDING = 16
 """People up to whom a task may hide agents from each other: everybody's view of everybody is their square."""
 
 
+@cpu_by_default
 def generate_crowd(
     model: DenoiserCore | Loaded,
     scene: Scene,

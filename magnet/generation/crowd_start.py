@@ -15,6 +15,7 @@ from magnet.generation.rollout import generate
 from magnet.motion.frames import from_planar
 from magnet.motion.scene import Scene, cat_agents, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import cpu_by_default
 from magnet.sampling.options import LEAST_SPACING, MOST_SPACING, SamplerOptions
 from magnet.tasks.joint import Generation
 
@@ -31,6 +32,7 @@ SHAPES = 0.7
 """Standard deviation of the shape numbers of people who are made from nothing."""
 
 
+@cpu_by_default
 def start_crowd(
     model: DenoiserCore | Loaded,
     people: int,

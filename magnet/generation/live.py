@@ -27,6 +27,7 @@ from magnet.motion.frames import canonical_frame
 from magnet.motion.required import require_one, require_rate
 from magnet.motion.scene import Scene, empty_scene
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import cpu_by_default
 from magnet.sampling.guidance import Guidance
 from magnet.sampling.options import SamplerOptions
 from magnet.tasks import registry
@@ -102,6 +103,7 @@ class Live:
             cannot go on from.
     """
 
+    @cpu_by_default
     def __init__(
         self,
         model: DenoiserCore | Loaded,
@@ -134,6 +136,7 @@ class Live:
 
     # -- starting ------------------------------------------------------------------------------
 
+    @cpu_by_default
     def begin(self, people: int = 2, start: Scene | None = None) -> LiveChunk:
         """Start anew: from a scene, or from nothing with so many people."""
         begun = time.perf_counter()
@@ -216,6 +219,7 @@ class Live:
             fields["target"] = tuple(agent for agent in people if agent not in leads) or (0,)
         return kind(**fields)
 
+    @cpu_by_default
     def advance(self) -> LiveChunk:
         """Generate the next chunk and append it; if it was `asked` for, the one between the keyframes instead.
 
@@ -262,6 +266,7 @@ class Live:
         self._partner = ((version, task, options, begins + answer.frames), partner)
         return answer.replace(names=(), given=None if given.given is None else given.given[:, CONTEXT:])
 
+    @cpu_by_default
     def between(self) -> LiveChunk:
         """Generate anew, by in-betweening, from a second before the first keyframe to the last; the rest is forgotten.
 

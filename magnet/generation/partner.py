@@ -17,6 +17,7 @@ from magnet.generation.online import OnlineRollout
 from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
+from magnet.precision import cpu_by_default
 from magnet.sampling.options import SamplerOptions
 from magnet.sampling.schedule import Grid
 from magnet.tasks.partner import MotionControl, chosen
@@ -64,6 +65,7 @@ class Partner:
             longer than the model's window.
     """
 
+    @cpu_by_default
     def __init__(
         self,
         denoiser: DenoiserCore | Loaded,
@@ -97,6 +99,7 @@ class Partner:
         self._answering = False  # still True with the lock free: an answer was interrupted half-way
 
     @property
+    @cpu_by_default
     def past(self) -> Scene:
         """The last frames of everybody, given and answered, as far back as the model or its decoder still looks.
 
@@ -107,6 +110,7 @@ class Partner:
             held = world.given.slice(0, world.finalized * TOKEN_FRAMES)
         return held.permute_agents(torch.arange(self._present.shape[1]))
 
+    @cpu_by_default
     def answer(self, frames: Scene) -> Scene:
         """The same frames with the answer in them, final; what is given in them comes back as it is.
 

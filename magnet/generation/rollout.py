@@ -38,7 +38,7 @@ from magnet.motion.required import require_rate
 from magnet.motion.scene import Scene, cat_time
 from magnet.motion.tokens import TOKEN_FRAMES
 from magnet.packing import count_unseen_writes
-from magnet.precision import dtype_of
+from magnet.precision import cpu_by_default, dtype_of, each_cpu_by_default
 from magnet.sampling.faint import faint_levels
 from magnet.sampling.grid import planning_grid
 from magnet.sampling.noise import LEVELS, NoiseStream
@@ -59,6 +59,7 @@ ENCODED = 8
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
+@cpu_by_default
 def generate(
     model: DenoiserCore | Loaded,
     scene: Scene,
@@ -105,6 +106,7 @@ def generate(
     return cat_time(list(rollout.chunks()))
 
 
+@cpu_by_default
 def stream(
     model: DenoiserCore | Loaded,
     scene: Scene,
@@ -226,6 +228,7 @@ class Rollout:
         kind = model.device.type
         self._autocast = (kind, torch.get_autocast_dtype(kind), torch.is_autocast_enabled(kind))
 
+    @each_cpu_by_default
     def chunks(self) -> Iterator[Scene]:
         """Everything, chunk by chunk."""
         start, before = 0, None

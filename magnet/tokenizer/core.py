@@ -17,6 +17,7 @@ from magnet.body import Body
 from magnet.motion.frames import POSE_FEATURES
 from magnet.motion.scene import Scene
 from magnet.motion.tokens import TOKEN_FRAMES, by_token
+from magnet.precision import cpu_by_default
 from magnet.tokenizer.base import Quantizer
 from magnet.tokenizer.checkpoint import check_weights, read_checkpoint, shaping
 from magnet.tokenizer.features import delta_known, features, fold, put, statistics, unfold
@@ -188,6 +189,7 @@ class TokenizerCore(nn.Module):
         return super().requires_grad_(requires_grad)
 
     @classmethod
+    @cpu_by_default
     def load(cls, path: str | Path) -> Self:
         """A trained tokenizer, from its checkpoint, from that of a denoiser, or by a shipped model's name.
 
