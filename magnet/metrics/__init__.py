@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import Metric
 
 from magnet.body.contact import hand_distance, penetration_depth, segment_distance, toe_steps
 from magnet.body.energy import hand_points
 from magnet.metrics.base import ClipMeans, MotionMetric, Of
 from magnet.metrics.body_depth import BodyDepth
+from magnet.metrics.collection import MotionMetrics
 from magnet.metrics.columns import Beside, Better, Column, beside, column, columns_of
 from magnet.metrics.diversity import Diversity, diversity
 from magnet.metrics.floor import Down, Floating, GroundPenetration, lowest_foot
@@ -49,6 +50,7 @@ __all__ = [
     "Jolts",
     "MotionInteraction",
     "MotionMetric",
+    "MotionMetrics",
     "NearestTraining",
     "PartnerBearing",
     "PartnerDistance",
@@ -82,7 +84,7 @@ __all__ = [
 ]
 
 
-def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> MetricCollection:
+def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> MotionMetrics:
     """Every metric of the paper's tables, a few more, and those of installed packages (entry points `magnet.metrics`).
 
     They are fed together: `update(generated, truth, present)`.
@@ -94,19 +96,19 @@ def all_metrics(fps: float = FPS, scored: Tensor | None = None, confidence: floa
     """
     ours = _ours(fps, scored, confidence)  # made first: it refuses what no metric takes
     others = other_metrics(_ours, "generated", scored, fps, confidence)
-    return MetricCollection({**ours, **others}, compute_groups=False)
+    return MotionMetrics({**ours, **others}, compute_groups=False)
 
 
 def ground_truth_metrics(
     fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None
-) -> MetricCollection:
+) -> MotionMetrics:
     """What recorded motion itself has, under the names of `all_metrics`: the ground truth's row of a table.
 
     Fed like `all_metrics`; what is generated is not read.
     """
     ours = _of_motion(fps, "truth", scored, confidence)
     others = other_metrics(_ours, "truth", scored, fps, confidence)
-    return MetricCollection({**ours, **others}, compute_groups=False)
+    return MotionMetrics({**ours, **others}, compute_groups=False)
 
 
 def _ours(fps: float = FPS, scored: Tensor | None = None, confidence: float | None = None) -> dict[str, Metric]:

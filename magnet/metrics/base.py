@@ -90,6 +90,10 @@ class MotionMetric(Metric):
     def compute(self) -> dict[str, Tensor]:
         """What was measured, float64 scalars by name."""
 
+    def set_dtype(self, dst_type: str | torch.dtype) -> MotionMetric:
+        """Nothing: sums stay float64, since in fewer digits differences of large ones are lost."""
+        return self
+
     def plot(self, val: Any = None, ax: Any = None) -> Any:
         """A figure and axis of what was measured, or of `val`: a result, or a list of them over time.
 

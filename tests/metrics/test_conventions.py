@@ -74,6 +74,17 @@ def test_a_batch_may_be_measured_in_inference_mode_and_the_next_outside(kind: ty
 
 
 @pytest.mark.parametrize("kind", MADE)
+def test_sums_have_the_same_digits_whatever_precision_a_program_asks_for(kind: type[Metric]) -> None:
+    truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None] + 30
+    expected, metric = kind(), kind().half().set_dtype(torch.float16)
+    for each in (expected, metric):
+        each.update(truth[None] + 0.1, truth)
+    found = metric.compute()
+    assert all(value.dtype == torch.float64 for value in found.values())
+    torch.testing.assert_close(found, expected.compute(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("kind", MADE)
 def test_sums_are_not_written_into_memory_that_processes_share(kind: type[Metric]) -> None:
     """What is sent to a spawned process lies in such memory, the same for all of them."""
     truth = standing_people(40, 2) + torch.linspace(0, 1, 40).square()[:, None, None, None]
