@@ -273,6 +273,8 @@ def test_where_the_clock_runs_slower_tokens_are_due_later_and_nothing_else_chang
         took.append(line.now - begun)
     assert took[1] == pytest.approx(4 * took[0], rel=0.02)
     assert reports[0]["late"] == reports[1]["late"] == 0 and reports[1]["tokens"] == 10
+    process, _ = played(Line([]), 0, 0.25)
+    assert (process.patience, process.meet) == (5 / 4, 30 / 4), "who waits does so for as many real seconds"
 
 
 def test_a_recording_keeps_the_pace_of_the_others_where_that_is_asked_for():

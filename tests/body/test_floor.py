@@ -92,6 +92,8 @@ def test_of_people_who_are_all_off_the_floor_the_one_nearest_to_it_says_how_far(
     low = torch.tensor([[0.5, 1.0, torch.nan], [-1.0, -0.5, torch.nan]])[:, None].expand(2, 40, 3)
     assert off_floor(low, low.isfinite()).tolist() == [0.5, -0.5]
     assert off_floor(low[:, :0], low[:, :0].isfinite()).tolist() == [0.0, 0.0]
+    one_near = torch.tensor([[1.0, 0.1], [-1.0, 0.1]])[:, None].expand(2, 40, 2)
+    assert off_floor(one_near, one_near.isfinite()).tolist() == [0.0, 0.0]
 
 
 def test_the_scene_farthest_from_the_floor_is_told_over_it_or_under():
