@@ -29,6 +29,9 @@ REFERENCES = ("ground truth", "training set")
 
 RESULTS_FORMAT = 1
 
+WIDEST = 40
+"""Letters of a method's name in one line of a table."""
+
 FIRST = ("fd", "fd_pair", "div", "mpjpe@1s", "mpjpe_mean@1s", "fs")
 """Columns that a short table begins with; others follow as they were measured."""
 
@@ -224,7 +227,7 @@ def print_table(
 
 def _table(results: Results, metrics: list[str], best: dict[str, set[str]], intervals: bool) -> Table:
     table = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False, collapse_padding=True)
-    table.add_column("method", no_wrap=True)
+    table.add_column("method", overflow="fold", max_width=WIDEST)  # a long name takes lines, not the numbers' room
     for metric in metrics:
         table.add_column(_in_two_lines(results, metric), justify="right", no_wrap=True, vertical="bottom")
     for method in results.rows:

@@ -80,6 +80,8 @@ class Submission:
         path = Path(path)
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such file")
+        if path.is_dir():
+            raise ValueError(f"{path}: is a folder, expected a submission's npz, such as {path / '*.npz'}")
         try:
             with load_npz(path, KEYS) as file:
                 lacking = [key for key in KEYS if key not in file.files]
@@ -94,7 +96,7 @@ class Submission:
         _require_scenes(path, names, benchmark.scenes)
         joints = _joints(path, read["joints"], benchmark, str(read["task"]))
         require_people(str(path), joints, benchmark.sight(str(read["task"])).generated)
-        method = str(read["method"]).strip() or path.stem
+        method = " ".join(str(read["method"]).split()) or path.stem
         return Submission(str(read["benchmark"]), str(read["task"]), method, names, joints, path.name)
 
 

@@ -195,3 +195,11 @@ def test_real_recordings_give_the_benchmarks_scenes(cmu_root: Path, tmp_path: Pa
     (results,) = score(benchmark, datamodule, [handed], baselines=False).values()
     assert results.rows["recorded"]["mpjpe"] == pytest.approx(0, abs=1e-5)
     assert results.rows["recorded"]["fs"] == pytest.approx(results.rows["ground truth"]["fs"], rel=1e-3)
+
+
+def test_a_methods_name_is_one_line_and_a_folder_is_no_submission(tmp_path: Path) -> None:
+    benchmark, _, truth = made()
+    path = submitted(truth, method=" two\nlines ").save(tmp_path / "a.npz", benchmark.fps)
+    assert Submission.load(path, benchmark).method == "two lines"
+    with pytest.raises(ValueError, match=r"is a folder, expected a submission's npz, such as .*\*\.npz"):
+        Submission.load(tmp_path, benchmark)

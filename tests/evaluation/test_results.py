@@ -51,6 +51,17 @@ def test_a_table_shows_every_number_however_narrow_the_screen(results: Results, 
     assert "[0.190, 0.223]" in printed(results, metrics=["mpjpe"], intervals=True)
 
 
+@pytest.mark.parametrize("width", [100, 60])
+def test_a_methods_long_name_takes_no_room_from_numbers(results: Results, width: int) -> None:
+    name = "a method of a very long name [with brackets] " * 5
+    text = printed(
+        Results({name: results.rows["magnet"], "NN": results.rows["NN"]}), width, metrics=results.metrics[:3]
+    )
+    assert all(number in text for number in ("0.283", "2.91", "0.205", "0.354", "0.470"))
+    assert max(map(len, text.splitlines())) <= width
+    assert "".join(name.split()) in "".join(line[:41].replace(" ", "") for line in text.splitlines())
+
+
 def test_the_best_is_marked_and_recordings_do_not_compete(results: Results) -> None:
     assert results.best("fd") == {"magnet"}
     assert results.best("div") == {"magnet"}
