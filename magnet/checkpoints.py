@@ -190,6 +190,13 @@ def class_of(checkpoint: dict[str, Any]) -> str:
     return str(model.get("class_path") or "magnet.Denoiser")
 
 
+def digest(path: Path) -> str:
+    """SHA-256 of a checkpoint, by which it is known whatever its name: of a released folder that of its config.json."""
+    if not path.is_dir():
+        return file_hash(path)
+    return config_hash(json.loads((path / "config.json").read_bytes()))
+
+
 def checksum_file(path: Path) -> Path:
     """The file with a checkpoint's SHA-256, in a line that `sha256sum -c` reads."""
     return path.with_name(path.name + ".sha256")

@@ -53,6 +53,14 @@ def test_what_is_saved_comes_back_with_a_checksum_that_sha256sum_reads(saved: Pa
     subprocess.run(["sha256sum", "-c", "--quiet", "last.ckpt.sha256"], cwd=saved.parent, check=True)
 
 
+def test_a_checkpoint_is_known_by_its_hash_whatever_its_name(
+    saved: Path, checkpoint: dict[str, Any], tmp_path: Path
+) -> None:
+    assert checkpoints.digest(saved) == checkpoints.checksum_file(saved).read_text()[:64]
+    released = checkpoints.write(checkpoint, tmp_path / "released")
+    assert checkpoints.digest(released) == json.loads((released / "config.json").read_text())["sha256"]
+
+
 def test_a_flipped_byte_anywhere_is_refused_by_every_reader(saved: Path) -> None:
     whole = saved.read_bytes()
     readers = (checkpoints.read, IO.load_checkpoint, read_checkpoint)

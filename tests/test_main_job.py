@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magnet import cli
+from magnet import checkpoints, cli
 from magnet.cli.main import COMMANDS
 from magnet.motion.scene import Scene
 
@@ -61,6 +61,7 @@ def test_the_main_job_ends_with_a_table(trained, capsys):
     assert results["rows"]["magnet"]["mpjpe"] > 0
     assert (out / "results.csv").read_text().count("\n") > 50
     assert {"git", "machine", "command"} <= set(results["meta"])
+    assert results["meta"]["checkpoint sha256"] == checkpoints.digest(Path(checkpoint))
 
 
 def test_predictions_are_scenes_and_pictures(trained):

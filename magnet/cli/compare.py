@@ -122,7 +122,9 @@ def show(a: Side, b: Side, full: bool) -> None:
     console.print(f"{names[0]} and {names[1]}, {scenes}", style="bold")
     for letter, side in zip("A" if alone else "AB", (a, b), strict=False):
         kept = side.results.meta.get("checkpoint")
-        trained = f", checkpoint {kept}" if kept not in (None, "None") else ""
+        digest = side.results.meta.get("checkpoint sha256")  # tells two of one name from each other
+        which = f" (sha256 {digest[:12]})" if digest else ""
+        trained = f", checkpoint {kept}{which}" if kept not in (None, "None") else ""
         console.print(f"{letter}: {side.folder}{trained}", markup=False, highlight=False, soft_wrap=True)
     if apart := differing(a.settings(), b.settings()):
         console.print(f"settings differ: {apart}", markup=False, highlight=False, soft_wrap=True)

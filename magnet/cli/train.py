@@ -137,6 +137,7 @@ class MagnetCLI(LightningCLI):
     def __init__(self, request: Request) -> None:
         self.request = request
         self.command, self.checkpoint, self.folder = request.command, request.checkpoint, request.folder
+        self.digest: str | None = None
         self.evaluator: Evaluator | None = None
         self.predicted: list[Any] = []
         self.ctrl_c = EndOfStep()
@@ -299,6 +300,7 @@ class MagnetCLI(LightningCLI):
             return refuse_task(self.request, self.model)
         if self.checkpoint is not None:
             stored = checkpoints.read(self.checkpoint)
+            self.digest = checkpoints.digest(self.checkpoint)  # now: a training that runs writes its last one anew
             self.model.on_load_checkpoint(stored)
             self.model.load_state_dict(stored["state_dict"])
         config = self.config_init[self.command]
@@ -350,6 +352,7 @@ class MagnetCLI(LightningCLI):
         assert self.request.task is not None
         task = self.request.task.name
         facts = {"task": task, "checkpoint": str(self.checkpoint), "data": self.config_dump.get("data")}
+        facts["checkpoint sha256"] = self.digest
         outputs.show_results(self.evaluator.results, self.folder, facts, self._option("full"))
 
     def after_predict(self) -> None:

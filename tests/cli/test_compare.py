@@ -95,6 +95,12 @@ def test_options_that_differ_are_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert compare.scalars("Mine(3) of x") == compare.scalars("") == {}, "a task whose repr is its own"
 
 
+def test_two_checkpoints_of_one_name_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    digests = {name: {"checkpoint": "last.ckpt", "checkpoint sha256": name * 64} for name in "cd"}
+    text = said(capsys, *(results_in(tmp_path / name, **facts) for name, facts in digests.items()))
+    assert "last.ckpt (sha256 cccccccccccc)\n" in text and "last.ckpt (sha256 dddddddddddd)\n" in text
+
+
 def test_folders_and_the_ground_truth_that_decides_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
