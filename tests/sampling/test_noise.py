@@ -122,8 +122,9 @@ def test_with_a_generator_each_a_scenes_noise_does_not_depend_on_the_batch():
 
 
 def test_generators_are_one_for_each_scene():
-    with pytest.raises(ValueError, match="got 1 generators for 2 scenes"):
-        NoiseStream((2, 3, 5), seeded(1))
+    for count in (1, 3):
+        with pytest.raises(ValueError, match=f"got {count} generators for 2 scenes"):
+            NoiseStream((2, 3, 5), seeded(*range(count)))
 
 
 @pytest.mark.parametrize("each", [False, True])
@@ -153,6 +154,13 @@ def test_with_a_generator_each_a_steps_noise_does_not_depend_on_the_batch():
     assert torch.equal(both[1:], alone)
 
 
+def test_each_step_of_a_token_has_noise_of_its_own():
+    stream = NoiseStream((1, 2, 50), seeded(1)[0], eta=1.0)
+    drawn = [stream.drawn(first, 1, [(0, level, None)]) for first, level in ((3, 800), (3, 600), (4, 800))]
+    flat = torch.stack(drawn).flatten(1)
+    assert float((torch.corrcoef(flat) - torch.eye(3)).abs().max()) < 0.4
+
+
 def test_a_scale_is_that_of_new_noise_alone():
     draws = [(0, 700, None), (1, 700, None)]
     plain, scaled = (NoiseStream((2, 3, 5), seeded(1, 2), eta=1.0, scale=scale) for scale in (1.0, 1.25))
@@ -167,6 +175,11 @@ def test_a_scale_is_that_of_new_noise_alone():
 def test_eta_is_a_share():
     with pytest.raises(ValueError, match="eta: got 2, expected 0"):
         NoiseStream((1, 1, 1), eta=2.0)
+
+
+def test_an_opening_before_a_level_of_much_noise_has_all_its_steps_above_it():
+    levels = opening_levels(975, 3)
+    assert len(levels) == 3 and (levels > 975).all() and (levels < LEVELS).all()
 
 
 @pytest.mark.parametrize("first", [0, 1, 70, 634, 947, 990, 998, 999])

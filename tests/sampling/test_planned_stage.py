@@ -12,7 +12,7 @@ from magnet.motion.tokens import TokenLayout
 from magnet.sampling import planned_stage
 from magnet.sampling.grid import Grid
 from magnet.sampling.guidance import Guidance
-from magnet.sampling.noise import NoiseStream
+from magnet.sampling.noise import NoiseStream, half_log_snr
 from magnet.sampling.sampler import begin
 from magnet.sampling.schedule import MaskSchedule, Stage
 from magnet.sampling.solvers import History
@@ -104,3 +104,51 @@ def test_steps_wait_for_nothing_and_are_few_operators(task: str, monkeypatch: py
     assert not mode.waits
     draws = sum(len(row) for row in planned_stage.plan_of(stage, LAYOUT, 1.0, None, torch.device("cpu")).draws)
     assert mode.operators < 10 + 45 * steps + 8 * draws, (mode.operators, steps, draws)
+
+
+# -- what views are shown, and what is read from them ------------------------------------------
+
+
+@torch.no_grad()
+def test_what_is_hidden_is_shown_as_noise_of_its_own_at_the_highest_level_and_what_is_asked_stays() -> None:
+    levels = torch.tensor([700, 0])[:, None, None].expand(-1, 3, P).clone()
+    visibility = torch.ones(P, 3, P, dtype=torch.bool)
+    visibility[1, 2, 0] = visibility[2, :, 1] = False
+    asked: list[tuple[Tensor, Tensor]] = []
+
+    def spy(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        asked.append((noisy.unflatten(0, (B, -1)), levels.unflatten(0, (B, -1))))
+        return torch.zeros_like(noisy)
+
+    generator = torch.Generator().manual_seed(0)
+    tokens, mask_noise = (torch.randn(B, 3, P, LAYOUT.width, generator=generator) for _ in range(2))
+    kept = tokens.clone()
+    how = planned_stage.Denoising(spy, torch.ones(B, P, dtype=torch.bool), LAYOUT)
+    planned_stage.run_planned_stage(how, Stage(0, levels.short(), visibility), tokens, mask_noise)
+    assert torch.equal(tokens, kept)
+    ((noisy, told),) = asked
+    assert noisy.shape[1] == P, "each agent sees something else"
+    for agent in range(P):
+        (view,) = [v for v in range(P) if torch.equal(told[0, v] == 1000, ~visibility[agent])]
+        hidden = LAYOUT.spread(LAYOUT.group_levels(torch.where(visibility[agent], 0, 1000)) == 1000)
+        assert torch.equal(noisy[:, view], torch.where(hidden, mask_noise, tokens))
+        assert (told[:, view][:, visibility[agent]] == 700).all()
+
+
+def test_a_pair_is_read_from_the_view_of_who_is_not_seen_where_only_one_sees_the_other() -> None:
+    hidden = torch.zeros(P, 1, P, dtype=torch.bool)
+    hidden[1, 0, 0] = True  # 1 does not see 0, who sees it
+    hidden[1, 0, 2] = hidden[2, 0, 1] = True  # neither sees the other
+    source = planned_stage.views_to_read(hidden, torch.tensor([5, 6, 7]), LAYOUT)[0]
+    partner = LAYOUT.partners(hidden.device)
+    read = {(p, int(partner[p, k])): int(source[p, 1 + k]) for p in range(P) for k in range(P - 1)}
+    assert source[:, 0].tolist() == [5, 6, 7]
+    assert read == {(0, 1): 5, (0, 2): 5, (1, 0): 5, (1, 2): 6, (2, 0): 7, (2, 1): 7}
+
+
+def test_a_prediction_is_extrapolated_by_half_a_step_and_no_farther_than_it_has_changed() -> None:
+    """In log-SNR: the step over twice the one before; not at first, nor at level 0."""
+    now, after, past = torch.tensor([[600, 300, 300, 1000, 600], [300, 200, 0, 900, 500], [700, 301, 600, -1, 1000]])
+    length, since = half_log_snr(after) - half_log_snr(now), half_log_snr(now) - half_log_snr(past.clamp_min(0))
+    share = planned_stage.carried_share(now, after, past)
+    assert share.tolist() == pytest.approx([min(float(length[0] / (2 * since[0])), 1.0), 1.0, 0.0, 0.0, 0.5])

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from magnet.sampling.noise import LEVELS
+from magnet.sampling.plans import token_levels
 from magnet.sampling.schedule import Grid, MaskSchedule, Stage
 from magnet.tasks import registry
 
@@ -229,10 +230,13 @@ def test_independently_each_token_passes_levels_of_its_own(pyramid_offset):
     assert plan.finished.all()
 
 
+def test_as_many_independent_levels_as_there_are_are_all_of_them():
+    every = token_levels(Grid(4, 2, 0, steps=LEVELS, window=4, noise_sampling="independent", spacing="even"))
+    assert torch.equal(every, torch.arange(LEVELS, -1, -1)[:, None, None].expand(-1, 4, 2))
+
+
 def test_independent_levels_are_drawn_evenly():
     """500 steps leave about every second level, so a token's median is near the middle."""
-    from magnet.sampling.plans import token_levels
-
     levels = token_levels(Grid(16, 4, 0, steps=500, noise_sampling="independent", spacing="even"))
     between = levels[1:-1].double() / 1000
     assert (between.mean() - 0.5).abs() < 0.01
