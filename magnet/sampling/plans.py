@@ -113,4 +113,4 @@ def window_positions(target: Tensor, grid: Grid) -> Iterator[tuple[int, int, int
         if last >= end:
             return
         first, last = last, min(last + grid.stride, end)
-        start = max(0, min(last - grid.window, grid.tokens - grid.window))
+        start = max(0, last - grid.window)

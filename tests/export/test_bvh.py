@@ -60,6 +60,25 @@ def test_only_people_present_are_written_and_one_keeps_the_plain_name(trio: Scen
     assert (body.joints(back)[:, :, 0] - body.joints(trio)[:, :, 1]).abs().max() < 1e-5
 
 
+def test_people_keep_the_numbers_of_their_slots(trio: Scene, body: Body, tmp_path: Path):
+    two = trio.replace(present=torch.tensor([[True, False, True]]))
+    assert [path.name for path in save_bvh(two, tmp_path / "a.bvh", body)] == ["a_person0.bvh", "a_person2.bvh"]
+
+
+@pytest.mark.parametrize(("unit", "long"), [("m", 1.0), ("cm", 100.0)])
+def test_last_bones_end_where_hands_toes_and_head_point(unit, long, trio: Scene, body: Body, tmp_path: Path):
+    """To the sides, forwards and up, the way that the bone before them goes for a few centimetres more."""
+    text = save_bvh(trio, tmp_path / "trio.bvh", body, unit=unit)[0].read_text()
+    found = re.findall(r"JOINT (\w+)\n\s*{\n[^{}]*End Site\n\s*{\n\s*OFFSET (\S+) (\S+) (\S+)", text)
+    ends = {name: np.array([float(number) for number in offset]) / long for name, *offset in found}
+    ways = {"left_wrist": [1, 0, 0], "right_wrist": [-1, 0, 0], "left_foot": [0, 0, 1], "right_foot": [0, 0, 1],
+            "head": [0, 1, 0]}  # fmt: skip
+    assert set(ends) == set(ways)
+    for name, way in ways.items():
+        length = np.linalg.norm(ends[name])
+        assert 0.05 < length < 0.2 and ends[name] @ way > 0.99 * length
+
+
 def test_the_header_states_order_and_rate(trio: Scene, body: Body, tmp_path: Path):
     text = save_bvh(trio, tmp_path / "trio.bvh", body)[0].read_text()
     assert text.count("CHANNELS 3 Zrotation Xrotation Yrotation") == 21

@@ -60,6 +60,21 @@ def test_without_guidance_nothing_changes(given):
     assert torch.equal(run(given), model(tokens, levels, present))
 
 
+def test_what_is_pure_noise_already_stays_the_noise_that_it_is(given):
+    """Where somebody's history is hidden, and where what is clean is shown faintly."""
+    tokens, levels, present, mask_noise = given
+    levels[:, 5] = LEVELS
+    shown: list[Tensor] = []
+
+    def spy(noisy: Tensor, levels: Tensor, present: Tensor) -> Tensor:
+        shown.append(noisy[:, 5])
+        return noisy
+
+    for faint in (None, torch.full((6, PEOPLE), 200)):
+        Guidance("history").predict(spy, tokens, levels, present, mask_noise, LAYOUT, faint)
+        assert torch.equal(shown.pop(), tokens[:, 5].repeat_interleave(2, dim=0))
+
+
 def test_history_guidance_is_the_papers_formula(given):
     cond, uncond = with_history(given, [0, 1, 2]), with_history(given, [])
     assert torch.allclose(run(given, kind="history", weight=0.7), 1.7 * cond - 0.7 * uncond, atol=1e-6)
