@@ -269,6 +269,15 @@ def test_clips_are_kept_as_they_come_and_shared_by_several(made):
         for _ in range(4):
             rolling.keep(batch)
         assert len(rolling.kept) == 2 and all(each is batch for each in rolling.kept)
+        rolling.keep(newest := batch.select(torch.arange(9)))
+        assert rolling.kept[0] is batch and rolling.kept[1] is newest, "the oldest is dropped"
+
+
+def test_after_a_training_nothing_is_kept_and_the_next_begins_anew():
+    rolling = RollOuts()
+    rolling.filled, rolling.kept = 5, [random_scene(1, 4, 1, torch.Generator().manual_seed(0))]
+    rolling.on_fit_end(None, None)
+    assert (rolling.filled, rolling.kept) == (-1, [])
 
 
 def stubbed(monkeypatch, model) -> list[tuple[Scene, int, Scene]]:

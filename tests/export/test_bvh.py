@@ -156,6 +156,20 @@ def test_wherever_somebody_walks_a_root_offset_puts_nobody_elsewhere(case, tmp_p
     assert np.abs(at[:, 0] - WALK).max() < 1e-3
 
 
+LYING = np.stack([np.linspace(0, 5, 60), np.r_[90.0, 89, 80, np.full(57, 12.0)], np.zeros(60)], axis=1)
+STILL = np.stack([1 + 0.1 * np.sin(np.arange(60)), 88 + 3 * np.sin(np.arange(60)), np.linspace(0, 9, 60)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("offset", "channels"),
+    [([0.0, 90, 0], LYING), ([0.0, 94, 4], LYING), ([10.0, 90, 5], STILL)],
+    ids=["who begins where the OFFSET is and lies down", "nearly there", "who hardly moves aside"],
+)
+def test_how_somebody_moves_on_does_not_make_channels_count_from_the_offset(offset, channels, tmp_path: Path):
+    _, at = read_bvh(walker(tmp_path / "a.bvh", np.array(offset), channels)).world()
+    assert np.abs(at[:, 0] - channels).max() < 1e-3
+
+
 def test_a_recording_stays_where_it_is_if_its_root_offset_repeats_the_first_frame(cmu_root: Path, tmp_path: Path):
     file = cmu_root / "bvh" / "test__walking__walking_1.bvh"
     if not file.is_file():
@@ -203,11 +217,12 @@ def test_blank_lines_may_come_before_the_hierarchy(trio: Scene, body: Body, tmp_
         read_bvh(path)
 
 
-@pytest.mark.parametrize("coding", ["utf-16", "utf-16-le", "utf-16-be"])
-def test_a_file_in_utf_16_is_read_as_one_in_utf_8(coding: str, trio: Scene, body: Body, tmp_path: Path):
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("coding", ["utf-16-le", "utf-16-be"])
+def test_a_file_in_utf_16_is_read_as_one_in_utf_8(coding: str, mark: str, trio: Scene, body: Body, tmp_path: Path):
     path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
     plain = read_bvh(path)
-    path.write_text(path.read_text(), encoding=coding)
+    path.write_text(mark + path.read_text(), encoding=coding)
     read = read_bvh(path)
     assert read.names == plain.names and np.array_equal(read.world()[1], plain.world()[1])
 
@@ -242,6 +257,18 @@ def test_frames_that_hold_nan_can_be_left_out_at_the_ends(trio: Scene, body: Bod
     assert part.tracked is None and np.allclose(part.world()[1], whole.world()[1][3:last])
     with pytest.raises(ValueError, match=rf"frame {last} holds NaN or infinity; .*--start and --end"):
         read_bvh(path, start=3)
+
+
+def test_frames_that_hold_nan_may_be_gaps_but_not_all_of_them(trio: Scene, body: Body, tmp_path: Path):
+    path = save_bvh(trio, tmp_path / "trio.bvh", body)[0]
+    path.write_text(re.sub(r"\S+\n$", "nan\n", path.read_text()))
+    assert read_bvh(path, gaps=True).tracked.tolist() == [True] * 19 + [False]
+    assert read_bvh(path, gaps=True, end=19).tracked is None
+    with pytest.raises(ValueError, match="frame 19 holds NaN or infinity; leave such frames out"):
+        read_bvh(path, gaps=True, start=19)
+    path.write_text(re.sub(r"(?m)^(-?[\d.]+ .*) \S+$", r"\1 nan", path.read_text()))
+    with pytest.raises(ValueError, match="frame 0 holds NaN or infinity; every frame does"):
+        read_bvh(path, gaps=True)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.5, 0.9, 0.99])

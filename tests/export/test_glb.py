@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from magnet.body.joints import JOINT_NAMES
 from magnet.export import save_glb
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
-from magnet.export.glb import frame_times, influences, linear, unbroken, vertex_normals
+from magnet.export.glb import Gltf, frame_times, influences, linear, unbroken, vertex_normals
 from magnet.export.naming import recognised
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
@@ -159,12 +160,47 @@ def test_the_file_is_whole_and_aligned(trio: Scene, body: Body, tmp_path: Path):
     assert kind == b"BIN\0" and 28 + text + binary == len(data)
 
 
+def test_numbers_of_any_size_are_aligned_and_the_buffer_is_whole():
+    gltf = Gltf()
+    for count in (1, 2, 3, 5):
+        gltf.accessor(np.arange(count), 5121, "SCALAR")
+        gltf.accessor(np.ones(1), 5126, "SCALAR")
+    gltf.accessor(np.arange(3), 5121, "SCALAR")
+    assert all(view["byteOffset"] % 4 == 0 for view in gltf.document["bufferViews"])
+    data = gltf.packed()
+    text = struct.unpack_from("<I", data, 12)[0]
+    binary = struct.unpack_from("<I", data, 20 + text)[0]
+    assert binary % 4 == 0 and len(data) == 28 + text + binary
+
+
+@pytest.mark.parametrize(("last", "component"), [(65534, 5123), (65535, 5125)])
+def test_vertices_are_numbered_by_two_bytes_while_none_is_the_number_that_restarts(last: int, component: int):
+    """65535 ends a strip in glTF."""
+    faces, weights = torch.tensor([[0, 1, last]]), torch.eye(22)
+    gltf = Gltf()
+    indices = gltf.skin_of(cast(Body, SimpleNamespace(faces=faces, weights=weights)))["indices"]
+    assert gltf.document["accessors"][indices]["componentType"] == component
+
+
+def test_turns_are_written_without_changes_of_sign(trio: Scene, body: Body, tmp_path: Path):
+    root = trio.T_world_root.clone()
+    turns = torch.from_numpy(Rotation.from_euler("Y", 40.0 * np.arange(24)[:, None], degrees=True).as_matrix()).float()
+    root[0, :, :, :3, :3] = turns[:, None]
+    opened = Opened(save_glb(trio.replace(T_world_root=root), tmp_path / "a.glb", body))
+    (animation,) = opened.gltf.animations
+    for channel in animation.channels:
+        if channel.target.path == "rotation":
+            values = opened.numbers(animation.samplers[channel.sampler].output)
+            assert (values[1:] * values[:-1]).sum(axis=1).min() > 0
+
+
 def test_people_wear_the_colours_of_pictures_by_slot(trio: Scene, body: Body, tmp_path: Path):
     gone = trio.replace(present=torch.tensor([[True, False, True]]))
     opened = Opened(save_glb(gone, tmp_path / "duo.glb", body))
     colours = [material.pbrMetallicRoughness.baseColorFactor for material in opened.gltf.materials]
     for got, slot in zip(colours, (0, 2), strict=True):
         assert got[:3] == pytest.approx(linear(AGENTS[slot]))
+    assert linear((10, 11, 0)) == pytest.approx([10 / 255 / 12.92, ((11 / 255 + 0.055) / 1.055) ** 2.4, 0])
     assert linear((255, 0, 188))[:2] == [1.0, 0.0] and linear((0, 0, 188))[2] == pytest.approx(0.5029, abs=1e-3)
 
 
@@ -203,6 +239,14 @@ def test_weights_sum_to_one_exactly(body: Body):
     back = np.zeros(tuple(body.weights.shape))
     np.add.at(back, (np.arange(len(back))[:, None], joints), shares / 65535)
     assert np.abs(back - body.weights.numpy()).max() < 1e-4
+
+
+def test_of_five_joints_the_four_strongest_share_what_the_fifth_had():
+    weights = np.zeros((1, 22))
+    weights[0, [2, 5, 7, 11, 13]] = 0.3, 0.1, 0.25, 0.2, 0.15
+    joints, shares = influences(weights)
+    assert joints.tolist() == [[2, 7, 11, 13]]
+    assert shares[0] / 65535 == pytest.approx(np.array([0.3, 0.25, 0.2, 0.15]) / 0.9, abs=2e-5)
 
 
 def test_quaternions_take_the_short_way_round():
