@@ -173,6 +173,20 @@ def test_numbers_of_any_size_are_aligned_and_the_buffer_is_whole():
     assert binary % 4 == 0 and len(data) == 28 + text + binary
 
 
+def test_nothing_is_written_as_an_empty_list_which_gltf_has_not():
+    text = Gltf().packed()[20:].split(b"BIN\0")[0]
+    assert b"[]" not in text.replace(b'"nodes":[]', b"")
+
+
+@pytest.mark.parametrize("root", ["floor", "none"])
+def test_frames_are_joined_by_lines_and_a_skin_names_its_topmost_bone(root: Any, trio: Scene, body: Body, tmp_path):
+    opened = Opened(save_glb(trio, tmp_path / "a.glb", body, BoneOptions(root=root)))
+    (animation,) = opened.gltf.animations
+    assert {sampler.interpolation for sampler in animation.samplers} == {"LINEAR"}
+    tops = [opened.gltf.nodes[skin.skeleton].name for skin in opened.gltf.skins]
+    assert tops == ["root" if root == "floor" else "pelvis"] * 3
+
+
 @pytest.mark.parametrize(("last", "component"), [(65534, 5123), (65535, 5125)])
 def test_vertices_are_numbered_by_two_bytes_while_none_is_the_number_that_restarts(last: int, component: int):
     """65535 ends a strip in glTF."""
@@ -274,6 +288,8 @@ def test_scenes_that_cannot_be_written_are_named(trio: Scene, body: Body, tmp_pa
         save_glb(trio.repeat(2), tmp_path / "a.glb", body)
     with pytest.raises(ValueError, match="0 people and 24 frames"):
         save_glb(trio.replace(present=torch.zeros(1, 3, dtype=torch.bool)), tmp_path / "a.glb", body)
+    with pytest.raises(ValueError, match="3 people and 0 frames"):
+        save_glb(trio.slice(0, 0), tmp_path / "a.glb", body)
     with pytest.raises(ValueError, match="belongs to body 'other'"):
         save_glb(trio.replace(body="other"), tmp_path / "a.glb", body)
 

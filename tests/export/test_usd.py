@@ -12,6 +12,8 @@ import torch
 
 from magnet.body import Body
 from magnet.export.bones import BoneOptions
+from magnet.export.drawing import AGENTS
+from magnet.export.glb import linear
 from magnet.export.usd import joint_paths, save_usd
 from magnet.testing import random_scene
 
@@ -56,6 +58,42 @@ def test_pixars_library_poses_joints_and_skin_where_the_body_has_them(suffix: st
             there = np.stack([place for name, place in found.items() if name != "root"])
             assert np.abs(there - joints[frame, person]).max() < 1e-4
             assert np.abs(points - vertices[frame, person]).max() < 1e-4
+
+
+@pytest.mark.parametrize("fps", [30.0, 120.0])
+def test_the_stage_says_its_rate_and_its_first_and_last_frame(fps: float, body: Body, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    scene = random_scene(1, 9, 1, torch.Generator().manual_seed(4)).replace(fps=fps)
+    stage = usd.Stage.Open(str(save_usd(scene, tmp_path / "solo.usda", body)))
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 8)
+
+
+@pytest.mark.parametrize("root", ["floor", "none"])
+def test_at_rest_joints_are_where_the_mesh_is_bound_to_them(root: Any, body: Body, tmp_path: Path) -> None:
+    """Standing on the floor in the person's own shape and colour."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    scene = random_scene(1, 3, 2, torch.Generator().manual_seed(4))
+    stage = Usd.Stage.Open(str(save_usd(scene, tmp_path / "duo.usda", body, BoneOptions(root=root))))
+    cache = UsdSkel.Cache()
+    for slot in range(2):
+        prim = stage.GetPrimAtPath(f"/scene/person_{slot}")
+        cache.Populate(UsdSkel.Root(prim), Usd.PrimDefaultPredicate)
+        skeleton = UsdSkel.Skeleton(prim.GetChild("skeleton"))
+        resting = cache.GetSkelQuery(skeleton).ComputeJointSkelTransforms(Usd.TimeCode(0), atRest=True)
+        rest, bound = np.array(resting), np.array(skeleton.GetBindTransformsAttr().Get())
+        assert np.abs(rest - bound).max() < 1e-6
+        mesh = UsdGeom.Mesh(prim.GetChild("body"))
+        points, (low, high) = np.array(mesh.GetPointsAttr().Get()), np.array(mesh.GetExtentAttr().Get())
+        assert abs(points[:, 1].min()) < 1e-5
+        np.testing.assert_allclose([low, high], [points.min(axis=0), points.max(axis=0)])
+        joints = body.rest_joints(scene.betas[0, slot]).numpy()
+        own = bound[-22:, 3, :3]
+        assert np.abs((own - own[0]) - (joints - joints[0])).max() < 1e-5
+        assert mesh.GetSubdivisionSchemeAttr().Get() == "none", "triangles are not smoothed"
+        np.testing.assert_allclose(mesh.GetDisplayColorAttr().Get()[0], linear(AGENTS[slot]), atol=1e-6)
 
 
 def test_people_keep_their_numbers(body: Body, tmp_path: Path) -> None:
