@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from magnet.agents.agent import HELD, KEPT, Agent, Player, motion_of, motion_told, poses_of
+from magnet.agents.agent import HELD, KEPT, Agent, Player, fingerprint, motion_of, motion_told, poses_of
 from magnet.agents.gate import Gate
 from magnet.agents.message import Message, pack
 from magnet.denoiser.options import Sampling
@@ -276,6 +276,68 @@ def test_what_cannot_be_is_named(denoiser, start):
         Agent(denoiser, start, NAMES, "A", AgenticSync(), SamplerOptions(settle="light", settle_blocks=True))
 
 
+# -- what is noted of everybody ----------------------------------------------------------------
+
+
+def notebook(start: Scene) -> tuple[Player, list[Message]]:
+    """A's, who plays a recording, and B's first 100 tokens."""
+    recording = random_scene(1, 402, 1, torch.Generator().manual_seed(9))
+    mine, other = Player(recording, start, NAMES, "A"), Player(recording, start, NAMES, "B")
+    return mine, [told for told in (other.step() for _ in range(100)) if told is not None]
+
+
+def test_a_recording_ends_with_its_last_whole_token_and_joins_behind_the_newest(start: Scene) -> None:
+    mine, others = notebook(start)
+    mine.hear(others[70])
+    mine.join()
+    assert mine.next == 71
+    assert len([*iter(mine.step, None)]) == 100 - 71, "two frames are left over"
+
+
+def test_who_comes_back_is_told_the_last_ten_tokens_of_both_and_nothing_of_the_start(start: Scene) -> None:
+    mine, others = notebook(start)
+    for few, many in ((3, 3), (40, 10)):
+        while mine.next < few:
+            mine.hear(others[mine.next])
+            mine.step()
+        told = [(message.agent, message.frame // 4) for message in mine.history(1)]
+        assert told == [(name, index) for name in "AB" for index in range(few - many, few)]
+
+
+def test_what_is_long_over_or_too_much_is_not_noted(start: Scene) -> None:
+    mine, others = notebook(start)
+    mine.next = 90
+    for message in others[:30]:
+        mine.hear(message)
+    assert [index for index in mine.pieces[1] if index >= 0] == [26, 27, 28, 29]
+    mine.next = 0
+    for ahead in range(400):
+        mine.hear(replace(others[0], frame=4 * ahead))
+    assert len(mine.pieces[1]) <= 4 * 64 + 1
+
+
+def test_a_token_is_worth_more_than_poses_and_stays_as_it_came_first(start: Scene) -> None:
+    mine, others = notebook(start)
+    token = np.zeros(80, np.float32)
+    for number, (message, kept) in enumerate(
+        [
+            (others[0], 0),
+            (replace(others[1], frame=0, token=token, model="m"), 1),
+            (replace(others[2], frame=0, token=token + 1, model="m"), 1),
+            (replace(others[3], frame=0), 1),
+        ]
+    ):
+        mine.hear(message)
+        piece = mine.pieces[1][0]
+        assert np.array_equal(piece.poses, others[kept].poses), number
+        assert (piece.token is None) == (number == 0) and (number == 0 or not piece.token.any())
+
+
+def test_weights_are_named_by_sixteen_letters(denoiser) -> None:
+    name = fingerprint(denoiser)
+    assert len(name) == 16 and name == fingerprint(denoiser) != fingerprint(tiny_denoiser(seed=1))
+
+
 def test_frames_of_who_joined_later_or_went_on_elsewhere_are_kept_at_their_times(start: Scene) -> None:
     recording = start.permute_agents(torch.tensor([0]))
     player, told = Player(recording, start, NAMES, "A"), []
@@ -293,6 +355,7 @@ def test_frames_of_who_joined_later_or_went_on_elsewhere_are_kept_at_their_times
 @pytest.mark.parametrize("far", [10**6, 2**38])
 def test_a_file_is_as_long_as_its_motion_and_ten_minutes_at_most_where_there_was_none(far: int) -> None:
     """Where the others had run for days when it joined, or had counted their frames from another time."""
+    assert HELD == 10 * 60 * 30
     recording = random_scene(1, 16, 1, torch.Generator().manual_seed(6))
     poses, frames = poses_of(recording), [far, far + 4, 2 * far, 2 * far + 8]
     made = motion_told(

@@ -164,6 +164,27 @@ def test_poses_change_over_eight_frames_slowly_at_first_and_at_last():
     torch.testing.assert_close(gone[:, :8].mean(dim=(0, 2, 3)), share, atol=0.05, rtol=0)
 
 
+def test_at_first_people_go_on_as_the_continuation_does_there_as_high_and_leaning_as_they_were():
+    scene = random_scene(2, 48, 2, torch.Generator().manual_seed(0))
+    high = scene.T_world_root.clone()
+    high[..., 1, 3] += 0.3
+    past, behind = scene.replace(T_world_root=high).slice(0, 8), scene.slice(12)
+    joined = eased(past, behind, 24)
+    own, last, there = (canonical_frame(each.T_world_root) for each in (joined, past, behind))
+    step = torch.linalg.solve(there[:, 0], there[:, 1])
+    torch.testing.assert_close(own[:, 0], last[:, -1] @ step, atol=1e-3, rtol=0)  # a lean turns a little
+    share = (torch.arange(1, 9) / 9) ** 2 * (3 - 2 * torch.arange(1, 9) / 9)
+    heights = [each.T_world_root[..., 1, 3] for each in (joined, past, behind)]
+    gone = (heights[0] - heights[1][:, -1:]) / (heights[2] - heights[1][:, -1:])
+    torch.testing.assert_close(gone[:, :8].mean(dim=(0, 2)), share, atol=0.02, rtol=0)
+    tilts = [
+        torch.linalg.solve(c, each.T_world_root)[..., :3, :3]
+        for c, each in zip((own, last, there), (joined, past, behind), strict=True)
+    ]
+    turned = geodesic(tilts[1][:, -1:], tilts[0]) / geodesic(tilts[1][:, -1:], tilts[2])
+    torch.testing.assert_close(turned[:, :8].mean(dim=(0, 2)), share, atol=0.05, rtol=0)
+
+
 def test_people_turn_back_the_short_way():
     """Ended at 172 degrees and recorded at -172: they turn by 16, not by 344."""
     scene = random_scene(1, 40, 1, torch.Generator().manual_seed(0))
