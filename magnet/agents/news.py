@@ -12,6 +12,8 @@ from magnet.motion.scene import FPS
 
 SELDOM = 30.0
 """Seconds for which what happens again and again is not said again."""
+LATE = 2.0
+"""Seconds after which a token is said to be late."""
 WHY = {
     "size": f"of more or fewer than five parts, or over {LARGEST} bytes",
     "checksum": "that do not come as they were sent",
@@ -44,7 +46,9 @@ class News:
         self.say = say
         self._jumped: float | None = None
         self._gone: set[str] = set()
-        self._said: set[str] = set()
+        self._looked: float | None = None
+        self._late: dict[str, float] = {}  # who is heard late, and since when; or when that was said
+        self._said: set[tuple[str, str]] = set()
 
     def begins(
         self, there: Collection[str], missing: Collection[str], deaf: Collection[str], joined: float | None
@@ -66,10 +70,16 @@ class News:
             self.say(f"{name} is back")
 
     def look(self, last: Mapping[str, float], at: float) -> None:
-        """Whether somebody has been silent for as long as who is gone. last: when each told frames."""
-        for name in [name for name, heard in last.items() if at - heard > GONE / FPS and name not in self._gone]:
-            self._gone.add(name)
-            self.say(f"{name} is gone: nothing has come for {GONE / FPS:.1f} s")
+        """Whether somebody has been silent for as long as who is gone. last: when each told frames.
+
+        Who has not looked for as long was stopped itself: what the others told is still to be read.
+        """
+        stopped = self._looked is not None and at - self._looked > GONE / FPS
+        self._looked = at
+        for name, heard in last.items():
+            if at - heard > GONE / FPS and name not in self._gone and not stopped:
+                self._gone.add(name)
+                self.say(f"{name} is gone: nothing has come for {GONE / FPS:.1f} s")
 
     def jumped(self, seconds: float, at: float) -> None:
         """It goes on where the others are; who is too slow does so again and again, and says it now and then."""
@@ -77,21 +87,31 @@ class News:
             self._jumped = at
             self.say(f"was {seconds:.1f} s behind the others, and goes on where they are")
 
+    def late(self, name: str, seconds: float, at: float) -> None:
+        """Somebody's token comes so late. Said of who stays late: lines that carry too little have it queue up."""
+        if seconds < LATE:
+            self._late.pop(name, None)
+        elif at - self._late.setdefault(name, at) > GONE / FPS:
+            self._late[name] = at + SELDOM
+            self.say(f"{name} is heard {seconds:.1f} s late: the line is too slow for what it tells, or it is itself")
+
     def refused(self, peer: str, reason: str) -> None:
         """A message was."""
-        self._once(f"messages of {peer} are refused ({reason}): {WHY.get(reason, 'of another form')}")
+        self._once(peer, reason, f"messages of {peer} are refused ({reason}): {WHY.get(reason, 'of another form')}")
 
     def of_other_weights(self, name: str) -> None:
         """Somebody's tokens are not understood."""
-        self._once(f"{name} runs other weights: its poses are read, and not its tokens")
+        self._once(name, "weights", f"{name} runs other weights: its poses are read, and not its tokens")
 
     def first_frame(self, name: str, told: np.ndarray, start: np.ndarray) -> None:
         """Somebody has told the first frame after the start scene, whose last had it here. (91,) each"""
         away = float(np.linalg.norm(told[:3] - start[:3]))
         if away > STEP:
-            self._once(f"{name} begins {away:.1f} m from where the start scene has it: is it the same scene?")
+            line = f"{name} begins {away:.1f} m from where the start scene has it: is it the same scene?"
+            self._once(name, "start", line)
 
-    def _once(self, line: str) -> None:
-        if line not in self._said:
-            self._said.add(line)
+    def _once(self, name: str, what: str, line: str) -> None:
+        """Say it, if nothing of the kind was said of them before."""
+        if (name, what) not in self._said:
+            self._said.add((name, what))
             self.say(line)

@@ -217,6 +217,7 @@ class Process:
                 self._hear(message, at)
             elif self.pace is None:  # who has begun knows better where it is than others do
                 self.member.hear(message)
+        self.news.look(self._running, self.clock())
 
     def _hear(self, message: Message, at: float) -> None:
         """Frames of who tells them."""
@@ -232,6 +233,7 @@ class Process:
         member.hear(message)
         if self.pace is not None and not again:
             self.pace.heard(name, index, at, message.lags.get(self.name))
+            self.news.late(name, at - self.pace.due(index), at)
 
     def _answer(self, hello: Message, at: float) -> None:
         """Tell somebody who has come back how things are, at most every two seconds."""
@@ -307,7 +309,6 @@ class Process:
         """Wait for what the next token is to see, as long as there is time, make it and tell it. False: it is over."""
         member, pace, cost = self.member, self.pace, self.report.cost()
         assert pace is not None
-        self.news.look(self._running, self.clock())
         if self.real_time and (behind := ((there := self._there()) - member.next) * PERIOD) > LOST:
             self.news.jumped(behind, self.clock())
             member.join(there + 1)  # too slow for them all the time, or stopped for a while

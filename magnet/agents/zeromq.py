@@ -47,7 +47,8 @@ class Other:
         last: when something came, or it was connected to.
         begun: parts of a message that has not been read to its end.
         tried: whether ZeroMQ has found where to connect to, since it last said that it would do so again.
-        met: whether the two have agreed to speak.
+        greeting: whether the two are connected and have not agreed to speak yet, which ZeroMQ ends after 30 s.
+        met: whether they have.
         cut: when the connection was closed, unless ZeroMQ connects again.
     """
 
@@ -58,6 +59,7 @@ class Other:
     last: float = field(default_factory=time.monotonic)
     begun: list[bytes] = field(default_factory=list)
     tried: bool = False
+    greeting: bool = False
     met: bool = False
     cut: float | None = None
 
@@ -187,18 +189,19 @@ class Link:
         while other.events.poll(0):
             kind = recv_monitor_message(other.events)["event"]
             if kind in (zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED):
-                other.tried = True
+                other.tried, other.greeting = True, kind == zmq.EVENT_CONNECTED
             elif kind == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-                other.met = True
+                other.met, other.greeting, other.last = True, False, time.monotonic()
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                 self._tell(f"{name} does not know our key: {name}'s folder of keys needs ours")
             elif kind in (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL):
                 self._tell(f"what listens at {other.address} has not {name}'s keys, or one of the two has none")
             elif kind == zmq.EVENT_DISCONNECTED:
-                other.cut, other.met, other.tried = (time.monotonic() if other.met else None), False, True
+                other.cut = time.monotonic() if other.met else None
+                other.met, other.greeting, other.tried = False, False, True
             elif kind == zmq.EVENT_CONNECT_RETRIED:
                 if not other.tried:
-                    self._tell(f"the host of {other.address} is not found, and is looked for again and again")
+                    self._tell(f"no way to the host of {other.address} is found, and is looked for again and again")
                 other.cut, other.tried = None, False
 
     def _renew(self, other: Other, now: float) -> None:
@@ -210,7 +213,7 @@ class Link:
                 f"{other.name} sent a part of over {LARGEST} bytes, or what is no message: ZeroMQ closed the "
                 "connection, which is made anew each time"
             )
-        if cut or now - other.last > SILENT:
+        if cut or (now - other.last > SILENT and not other.greeting):
             other.last, other.cut = now, None
             other.socket.disconnect(other.address)
             other.socket.connect(other.address)

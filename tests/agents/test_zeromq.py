@@ -177,7 +177,7 @@ def test_who_cannot_be_heard_for_a_key_or_a_name_is_said_why(tmp_path) -> None:
     assert says(addresses["A"], None) == [no_keys]
     nowhere = "tcp://nowhere.invalid:5601"
     assert says(nowhere, tmp_path / "ours") == [
-        f"the host of {nowhere} is not found, and is looked for again and again"
+        f"no way to the host of {nowhere} is found, and is looked for again and again"
     ]
     one.close()
 
