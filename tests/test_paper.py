@@ -33,10 +33,9 @@ DENOISER: dict[str, Any] = {
     | {"partner": 0.0, "hands": 0.0, "decoded_share": 0.25, "weighting": "uniform", "snr_gamma": 5.0},
     "self_forcing": {"share": 0.0, "placement": "fuse", "pairwise_weight": 0.02, "displaced": 0.0, "far": 0.0},
     "optimizer": {**ADAMW, "warmup_steps": 1000},
-    "sampling": dict.fromkeys(("stride", "pyramid_offset", "turn", "opening", "settle", "smooth_path", "together"))
-    | dict.fromkeys(
-        ("pairwise_weight", "noise_scale", "stabilization_level", "stabilization_beside", "stabilization_unseen")
-    )
+    "sampling": dict.fromkeys(("stride", "pyramid_offset", "turn", "opening", "settle", "settle_groups"))
+    | dict.fromkeys(("smooth_path", "together", "pairwise_weight", "noise_scale"))
+    | dict.fromkeys(("stabilization_level", "stabilization_beside", "stabilization_unseen"))
     | {"stabilization_after": 0},
     "cuda_graph": False,
     **RUN,

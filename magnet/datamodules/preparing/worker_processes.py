@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def unheard_ctrl_c() -> Iterator[None]:
-    """Processes that are started within it never hear Ctrl+C, which this one hears behind it."""
+    """Processes that are started within it never hear Ctrl+C, which this thread hears behind it."""
     if not hasattr(signal, "pthread_sigmask"):  # on Windows they hear it
         yield
         return
