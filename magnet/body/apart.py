@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -72,10 +73,16 @@ def excess_depth(one: Tensor, other: Tensor, keep: Apart) -> Tensor:
     a, b, radius = capsule_segments(one)
     c, d, _ = capsule_segments(other)
     first, second = nearest_points(a[..., :, None, :], b[..., :, None, :], c[..., None, :, :], d[..., None, :, :])
-    arm = torch.tensor(ARMS, device=one.device)
+    arm = _arms(one.device)
     allowed = torch.where(arm[:, None] | arm, keep.arms, keep.body).to(one)
     depth = radius[:, None] + radius - (first - second).norm(dim=-1) - allowed
     return torch.where(arm[:, None] & arm, -torch.inf, depth).amax(dim=(-1, -2))
+
+
+@functools.cache
+def _arms(device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # or training, later, could not use it
+        return torch.tensor(ARMS, device=device)
 
 
 def direction(one: Tensor, other: Tensor, near: Tensor) -> Tensor:

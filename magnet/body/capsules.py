@@ -5,6 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from magnet.body.indices import indices
+from magnet.waiting import constant
+
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_ELBOW, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_ELBOW, R_HIP, R_KNEE,
     R_SHOULDER, R_WRIST, SPINE1, SPINE2, SPINE3,
@@ -36,14 +39,13 @@ CAPSULES: tuple[Capsule, ...] = (
     Capsule(R_KNEE, R_ANKLE, 0.06, "right shin"),
 )
 """Hands and feet have none, so that holding hands is not a collision."""
+FROM, TO, RADII, _ = zip(*CAPSULES, strict=True)
 
 
 def capsule_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Ends of the 13 capsules. (..., 22, 3) -> (..., 13, 3), (..., 13, 3), radii (13,) in metres"""
-    radius = torch.tensor([capsule.radius for capsule in CAPSULES], dtype=joints.dtype, device=joints.device)
-    a = joints[..., [capsule.joint_a for capsule in CAPSULES], :]
-    b = joints[..., [capsule.joint_b for capsule in CAPSULES], :]
-    return a, b, radius
+    a, b = joints[..., indices(FROM, joints.device), :], joints[..., indices(TO, joints.device), :]
+    return a, b, constant(RADII, joints)
 
 
 def nearest_points(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:

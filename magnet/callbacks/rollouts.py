@@ -160,7 +160,7 @@ class RollOuts(Callback):
         count = len(self.tasks)
         which = int(torch.randint(count, (), generator=generator, device=generator.device)) if count > 1 else 0
         task = self.tasks[which]
-        people = torch.tensor([int(n) in sizes for n in batch.present.sum(dim=1)])
+        people = torch.tensor([n in sizes for n in batch.present.sum(dim=1).tolist()])
         if reads_ahead(task):  # the first slot answers others, who must be there
             people &= (batch.present[:, 0] & batch.present[:, 1:].any(dim=1)).cpu()
         whole = people if batch.valid is None else people & batch.valid.flatten(1).all(dim=1).cpu()

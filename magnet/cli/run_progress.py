@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from typing import Any
@@ -12,12 +13,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from magnet.cli.pipes import output_closed
 
+LOOKS = 2.0
+"""Seconds between two looks at a loss that a GPU is waited for."""
+
 
 def progress_bar(sampling: bool = False) -> ProgressBar:
     """A bar on a terminal, now and then a line elsewhere; for sampling it counts denoising steps."""
     if sampling:
         return SamplingProgress()
-    return RichProgressBar() if sys.stdout.isatty() else ProgressLines()
+    return Bars() if sys.stdout.isatty() else ProgressLines()
 
 
 def clock(seconds: float) -> str:
@@ -27,7 +31,29 @@ def clock(seconds: float) -> str:
     return f"{hour}:{minute:02}:{second:02}"
 
 
-class ProgressLines(ProgressBar):
+class ShowsLoss(ProgressBar):
+    """Shows the loss of a training on a GPU too, for which it is waited for only now and then."""
+
+    looked, loss = -math.inf, math.nan
+
+    def get_metrics(
+        self, trainer: Trainer, pl_module: LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """What Lightning shows, and the loss."""
+        shown = super().get_metrics(trainer, pl_module)
+        loss = None if "loss" in shown else trainer.callback_metrics.get("loss")
+        if loss is None:
+            return shown
+        if (now := time.monotonic()) >= self.looked + LOOKS:
+            self.looked, self.loss = now, float(loss)
+        return {**shown, "loss": self.loss}
+
+
+class Bars(ShowsLoss, RichProgressBar):
+    """Lightning's bars."""
+
+
+class ProgressLines(ShowsLoss):
     """Progress for logs: a line every `seconds`, with what is left of that work, reckoned from its second step on.
 
     What the first step waits for, such as data that are read and weights that are packed, no other waits for.

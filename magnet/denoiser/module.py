@@ -119,7 +119,7 @@ class Denoiser(DenoiserCore, TokenModel):
             settings = (self.loss, self.noise, self.self_forcing)
             losses = self.graphed(self._inputs(scene, made), derive(*place, "graph"), settings)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, prog_bar=False)
-        self.log("loss", losses["loss"], prog_bar=True, sync_dist=True)
+        self.log_loss(losses["loss"])
         return losses["loss"]
 
     def on_validation_epoch_start(self) -> None:

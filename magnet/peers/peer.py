@@ -119,7 +119,7 @@ class Peer(TokenModel):
         place = (self.global_step, batch_idx, self.global_rank)
         losses = self.losses(batch, step_generator(self.device, self.hparams["seed"], "train", *place))
         self.log_dict({f"train/{name}": value.detach() for name, value in losses.items()}, batch_size=batch.scenes)
-        self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes, sync_dist=True)
+        self.log_loss(losses["loss"], batch_size=batch.scenes)
         return losses["loss"]
 
     def on_validation_epoch_start(self) -> None:

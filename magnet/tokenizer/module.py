@@ -159,7 +159,7 @@ class Tokenizer(TokenizerCore, Trained):
         seen = features(batch)
         losses, pose, quantized = self.losses(seen, batch_idx)
         if self._trainer is not None:
-            self.log("loss", losses["loss"].detach(), prog_bar=True, batch_size=batch.scenes, sync_dist=True)
+            self.log_loss(losses["loss"], batch_size=batch.scenes)
             logged = {f"train/{name}": value.detach() for name, value in losses.items()}
             if self.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
                 logged |= {f"train/{name}": value for name, value in by_quantizer(quantized.counts).items()}

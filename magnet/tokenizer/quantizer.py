@@ -90,7 +90,7 @@ class ResidualVQ(Float32):
                 return Quantized(flat.view(vectors.shape), none, flat.new_zeros(()), unused)
             keep = torch.ones_like(flat[:, 0], dtype=torch.bool) if mask is None else mask.flatten()
             update = self.training and not self.frozen
-            if update and not bool(self.initialized):
+            if update and not self.started:
                 self.kmeans_init(flat.detach()[keep], generator)
             residual, latent = flat, torch.zeros_like(flat)
             index, commitment, counts = [], flat.new_zeros(()), []
@@ -112,14 +112,19 @@ class ResidualVQ(Float32):
             )
 
     @property
-    def waiting(self) -> bool:
-        """Whether vectors are left as they are, because there are no codes yet."""
-        if not self.waits or self.initialized.is_inference():
-            return self.waits and not bool(self.initialized)
+    def started(self) -> bool:
+        """Whether there are codes."""
+        if self.initialized.is_inference():
+            return bool(self.initialized)
         now = (self.initialized.data_ptr(), self.initialized._version)
         if self._started is None or self._started[0] != now:  # a GPU would be waited for each time
             self._started = (now, bool(self.initialized))
-        return not self._started[1]
+        return self._started[1]
+
+    @property
+    def waiting(self) -> bool:
+        """Whether vectors are left as they are, because there are no codes yet."""
+        return self.waits and not self.started
 
     def continuous(self, vectors: Tensor) -> Tensor:
         """The vectors as they are, not quantized: codes lie in the same space."""

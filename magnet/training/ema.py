@@ -59,7 +59,9 @@ class WeightEMA(WeightAveraging):
             )  # Lightning sets callbacks up first, and a copy would lack what the model makes there
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
-            self._average_model = Average(self._average_model.module, self.decay)
+            # The model is moved only later, and not every model says before where it will be.
+            copied = self._average_model.module.to(trainer.strategy.root_device)
+            self._average_model = Average(copied, self.decay)
 
     def _swap_models(self, pl_module: LightningModule) -> None:
         """Exchange the weights and their average.

@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
-from torch import nn
+from torch import Tensor, nn
 
 from magnet.training.duration import share_of_time
 from magnet.training.muon import MuonAdamW
 from magnet.training.options import OptimizerOptions
+from magnet.waiting import may_look
 
 
 def warmup_cosine(
@@ -56,6 +57,10 @@ class Trained(LightningModule):
     def learning_rate(self, rate: float) -> None:
         self.optimizer = dataclasses.replace(self.optimizer, learning_rate=rate)
         self.hparams["optimizer"] = dataclasses.asdict(self.optimizer)
+
+    def log_loss(self, loss: Tensor, **said: Any) -> None:
+        """Log what a step is trained on; bars show it by themselves where nobody waits for a GPU to know it."""
+        self.log("loss", loss.detach(), prog_bar=may_look(loss.device), sync_dist=True, **said)
 
     def begin(self) -> None:
         """Make ready what a first step needs, such as statistics of the data; called again, it changes nothing."""

@@ -12,13 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body import MIRROR
+from magnet.body.indices import indices
+from magnet.body.mirror import OTHER_SIDE
 from magnet.datamodules.clip import Ints
 from magnet.datamodules.store.memory import MemoryStore, WindowIndex
 from magnet.datamodules.store.reader import StoreSplit
 from magnet.datamodules.store.rows import ROW, SCALE, matrices
 from magnet.motion.frames import rigid
 from magnet.motion.scene import BODY_JOINTS, Scene
+from magnet.waiting import constant
 
 UNEVEN = 0.1
 """Largest difference between the shares of processes; if it is larger, all processes draw from all clips."""
@@ -26,7 +28,6 @@ QUAT = 4 * ROW["rotations"].subdtype[0].itemsize  # type: ignore[index]
 """Bytes of a rotation."""
 PELVIS: int = ROW.fields["pelvis"][1]  # type: ignore[index]
 """Byte of a row at which the pelvis's place begins."""
-OTHER_SIDE = [joint - 1 for joint in MIRROR[1:]]
 
 
 @dataclass(frozen=True)
@@ -180,25 +181,25 @@ class MappedStore(MemoryStore):
     def decoded(self, rows: RawBatch, clearance: float) -> Scene:
         """Decode rows to a batch on `device`."""
         raw = rows.raw.to(self.device, non_blocking=True)
-        present, groups = rows.present.to(self.device), torch.from_numpy(rows.windows.groups).to(self.device)
+        present, groups = rows.present.to(self.device, non_blocking=True), self.sent(rows.windows.groups)
         root = raw[..., :QUAT].contiguous().view(torch.int16)
         pelvis = raw[..., PELVIS:].contiguous().view(torch.float32)
         body = raw[..., QUAT:PELVIS].contiguous().view(torch.int16).unflatten(-1, (BODY_JOINTS - 1, 4))
         T_world_root = self._compose(rigid(matrices(root), pelvis), present, groups, rows.windows, clearance)
         chosen = np.flatnonzero(rows.windows.mirrored)
         if len(chosen):
-            index = torch.from_numpy(chosen).to(self.device)
+            index = self.sent(chosen)
             body.index_copy_(0, index, mirrored(body[index]))
-            flip = torch.tensor([-1.0, 1.0, 1.0, 1.0], device=self.device)
+            flip = constant((-1.0, 1.0, 1.0, 1.0), T_world_root)
             T_world_root.index_copy_(0, index, T_world_root[index] * (flip[:, None] * flip))
         return Scene(
             body_rot=matrices(body),
             T_world_root=T_world_root,
-            betas=rows.betas.to(self.device),
+            betas=rows.betas.to(self.device, non_blocking=True),
             present=present,
             fps=self.fps,
             body=self.body,
-            valid=rows.valid.to(self.device),
+            valid=rows.valid.to(self.device, non_blocking=True),
             names=rows.names,
         )
 
@@ -215,6 +216,6 @@ def mirrored(body: Tensor) -> Tensor:
     (..., 21, 4) int16, xyzw -> same
     """
     whole = body.view(torch.int64)[..., 0]
-    swapped = whole[..., OTHER_SIDE].unsqueeze(-1).view(torch.int16)
+    swapped = whole[..., indices(OTHER_SIDE, whole.device)].unsqueeze(-1).view(torch.int16)
     swapped[..., 1:3].neg_()
     return swapped

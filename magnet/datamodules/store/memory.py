@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from magnet.body.indices import indices
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules.clip import Clip, Ints
 from magnet.motion.frames import from_planar
@@ -164,18 +165,15 @@ class MemoryStore:
         """
         t = self.tensors
 
-        def to_index(array: Ints) -> Tensor:
-            return torch.from_numpy(array).to(self.device, non_blocking=True)
-
-        clips, starts = to_index(np.maximum(windows.clips, 0)), to_index(windows.starts)
-        members, groups = to_index(windows.members), to_index(windows.groups)
+        clips, starts = self.sent(np.maximum(windows.clips, 0)), self.sent(windows.starts)
+        members, groups = self.sent(windows.members), self.sent(windows.groups)
         there, member = members >= 0, members.clamp_min(0)
 
         wanted = starts[..., None] + torch.arange(frames, device=self.device)  # (B, 2, T)
         last = t["length"][clips][..., None] - 1
         frame = torch.minimum(wanted, last)
         good = (wanted <= last) & t["valid"][t["first_frame"][clips][..., None] + frame]
-        valid = (good | to_index(windows.clips)[..., None].lt(0)).all(dim=1)
+        valid = (good | self.sent(windows.clips)[..., None].lt(0)).all(dim=1)
 
         clip = clips.gather(1, groups)  # (B, P)
         frame_of_slot = frame.gather(1, groups[..., None].expand(-1, -1, frames))  # (B, P, T)
@@ -194,13 +192,17 @@ class MemoryStore:
         )
         return self._mirror(scene, windows)
 
+    def sent(self, array: NDArray[Any], dtype: torch.dtype | None = None) -> Tensor:
+        """An array on the store's device, for which nobody waits: a GPU may still be busy with the step before."""
+        return torch.from_numpy(array).to(dtype=dtype).to(self.device, non_blocking=True)
+
     def _compose(
         self, T_world_root: Tensor, there: Tensor, groups: Tensor, windows: WindowIndex, clearance: float
     ) -> Tensor:
-        chosen = torch.from_numpy(np.flatnonzero(windows.clips[:, 1] >= 0)).to(self.device)
+        chosen = self.sent(np.flatnonzero(windows.clips[:, 1] >= 0))
         if not len(chosen):
             return T_world_root
-        relative_pose = torch.from_numpy(windows.relative_pose).to(self.device, T_world_root.dtype)[chosen]
+        relative_pose = self.sent(windows.relative_pose, T_world_root.dtype)[chosen]
         moved = place_apart(T_world_root[chosen], there[chosen], groups[chosen] == 1, relative_pose, clearance)
         return T_world_root.index_copy_(0, chosen, moved)
 
@@ -208,7 +210,7 @@ class MemoryStore:
         # Only the chosen half is computed, in place: on a CPU, moving the numbers is what a batch costs.
         chosen = np.flatnonzero(windows.mirrored)
         if len(chosen):
-            index = torch.from_numpy(chosen).to(self.device)
+            index = self.sent(chosen)
             half = mirror_scene(scene.replace(**{n: v[index] for n, v in scene.tensors().items()}, names=()))
             scene.body_rot.index_copy_(0, index, half.body_rot)
             scene.T_world_root.index_copy_(0, index, half.T_world_root)
@@ -260,7 +262,7 @@ def place_apart(
         (B, T, P, 4, 4) in the first group's world.
     """
     yaw, direction, distance = relative_pose.unbind(-1)
-    ground = T_world_root[..., [0, 2], 3]
+    ground = T_world_root[..., indices((0, 2), T_world_root.device), 3]
     ours, theirs = present & ~second, present & second
 
     def centre(group: Tensor) -> Tensor:
