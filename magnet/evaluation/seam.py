@@ -30,12 +30,7 @@ WORLD = "the world of the inputs"
 def seam_doubts(joints: Tensor, recorded: Tensor, names: Sequence[str], sight: Sight, fps: float) -> list[str]:
     """What is unlikely of where submitted joints begin, a line each; nothing if they go on as recorded people may.
 
-    Args:
-        joints: (B, S, T, P, 22, 3) metres, of the frames after the context.
-        recorded: (B, context + T, P, 22, 3) metres.
-        names: of the scenes.
-        sight: what the task gives and asks for.
-        fps: frames a second.
+    Arguments are those of `doubts`.
     """
     scored = sight.generated[0]
     context = recorded.shape[1] - joints.shape[2]
