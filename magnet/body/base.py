@@ -24,6 +24,7 @@ from magnet.body.pickles import pickled_arrays
 from magnet.files import DAMAGED, load_npz
 from magnet.motion.scene import BODY_JOINTS, Scene
 from magnet.precision import cpu_by_default
+from magnet.waiting import constant
 
 SHAPES = 10
 """Shape numbers of a body; a file may have more, which are ignored."""
@@ -172,12 +173,10 @@ class Body(nn.Module):
         steps = step.view(poses, len(by_depth), 12).index_select(1, by_depth).transpose(0, 1).reshape(-1, 3, 4)
         with _exact(body_rot):
             level = T_world_root[..., :3, :].expand(*lead, 3, 4).reshape(1, poses, 3, 4)
-            levels = [level]
+            levels, place = [level], constant((0.0, 0.0, 0.0, 1.0), level)
             for up, mine in zip(ups, steps.split([len(up) * poses for up in ups]), strict=True):
-                above = level.index_select(0, up).flatten(0, 1)
-                below = above[..., :3] @ mine
-                below[..., 3] += above[..., 3]
-                level = below.view(len(up), poses, 3, 4)
+                above = level.index_select(0, up).view(-1, 3, 4)
+                level = torch.baddbmm(above * place, above[..., :3], mine).view(len(up), poses, 3, 4)
                 levels.append(level)
             whole = torch.cat(levels).index_select(0, order).transpose(0, 1).view(*lead, len(order), 3, 4)
             return whole[..., :3], whole[..., 3]

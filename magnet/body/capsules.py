@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from magnet.body.indices import indices
+from magnet.body.indices import picked
 from magnet.waiting import constant
 
 from magnet.body.joints import (  # isort: skip
@@ -44,8 +44,7 @@ FROM, TO, RADII, _ = zip(*CAPSULES, strict=True)
 
 def capsule_segments(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Ends of the 13 capsules. (..., 22, 3) -> (..., 13, 3), (..., 13, 3), radii (13,) in metres"""
-    a, b = joints[..., indices(FROM, joints.device), :], joints[..., indices(TO, joints.device), :]
-    return a, b, constant(RADII, joints)
+    return picked(joints, FROM), picked(joints, TO), constant(RADII, joints)
 
 
 def nearest_points(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from magnet.body.base import Body
-from magnet.body.capsules import CAPSULES
-from magnet.body.indices import indices
+from magnet.body.capsules import FROM, RADII, TO
+from magnet.body.indices import indices, picked
+from magnet.waiting import constant
 
 from magnet.body.joints import (  # isort: skip
     HEAD, L_ANKLE, L_COLLAR, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, NECK, PELVIS, R_ANKLE, R_COLLAR,
@@ -94,12 +95,11 @@ def with_measured(fitted: FittedCapsules, rest: Tensor) -> FittedCapsules:
     rest: (B, 1, P, 22, 3) joints at rest, metres.
     """
     at = rest[:, 0]
-    first = [capsule.joint_a for capsule in CAPSULES]
-    along = at[..., [capsule.joint_b for capsule in CAPSULES], :] - at[..., first, :]
+    along = picked(at, TO) - picked(at, FROM)
     ends = torch.stack([torch.zeros_like(along), along], dim=-2).to(fitted.ends)
-    radius = fitted.radius.new_tensor([capsule.radius for capsule in CAPSULES]).expand(ends.shape[:3])
+    radius = constant(RADII, fitted.radius).expand(ends.shape[:3])
     both = torch.cat([fitted.ends, ends], dim=2), torch.cat([fitted.radius, radius], dim=2)
-    return FittedCapsules(*both, (*fitted.bones, *first))
+    return FittedCapsules(*both, (*fitted.bones, *FROM))
 
 
 _KEPT: WeakKeyDictionary[Body, dict[bytes, FittedCapsules]] = WeakKeyDictionary()

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from magnet.body.energy import hand_points
 from magnet.body.indices import pairs_of
 from magnet.motion.resample import smoothstep
 from magnet.motion.runs import true_runs
+
+Floats = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
 
 HELD = 0.20
 """Metres between the middles of two hands that hold each other, as in the metric."""
@@ -79,30 +84,33 @@ def lasting_holds(
     between, both = between_hands(joints, present)
     apart = between.norm(dim=-1)
     near = (apart < PARTED) & both[:, None, :, None, None]
-    held, share = torch.zeros_like(near), torch.zeros_like(apart)
+    # Looked at once: hold by hold, tensors of some frames would cost more than all else.
+    metres, close = apart.detach().cpu().numpy(), near.cpu().numpy()
+    held_on = np.zeros_like(close[:, 0]) if before is None else before.cpu().numpy()
+    held, share = np.zeros_like(close), np.zeros_like(metres)
     people = list(combinations(range(joints.shape[2]), 2))
-    for b in range(len(apart)):
-        busy = torch.zeros(joints.shape[2], 2, apart.shape[1], dtype=torch.bool, device=apart.device)
-        for hold in sorted(_found(apart[b], near[b], None if before is None else before[b], fps, takes), reverse=True):
+    for b in range(len(metres)):
+        busy = np.zeros((joints.shape[2], 2, metres.shape[1]), dtype=bool)
+        for hold in sorted(_found(metres[b], close[b], held_on[b], fps, takes), reverse=True):
             frames, (p, q) = slice(hold.start, hold.stop), people[hold.pair]
             free = ~busy[p, hold.one, frames] & ~busy[q, hold.other, frames]
             busy[p, hold.one, frames] |= free
             busy[q, hold.other, frames] |= free
             held[b, frames, hold.pair, hold.one, hold.other] = free
-            share[b, frames, hold.pair, hold.one, hold.other] = _eased(hold, apart.shape[1], fps).to(share)
+            share[b, frames, hold.pair, hold.one, hold.other] = _eased(hold, metres.shape[1], fps)
     shorter = GRIP / apart.clamp_min(GRIP)  # 1 where they are near enough
-    return held, between * torch.lerp(torch.ones_like(shorter), shorter, share)[..., None]
+    eased = torch.lerp(torch.ones_like(shorter), shorter, torch.from_numpy(share).to(apart))
+    return torch.from_numpy(held).to(near.device), between * eased[..., None]
 
 
-def _found(apart: Tensor, near: Tensor, before: Tensor | None, fps: float, takes: float) -> list[Hold]:
-    """The holds of each two hands by themselves. apart, near (T, Q, 2, 2), before (Q, 2, 2)"""
+def _found(metres: Floats, close: Bools, held_on: Bools, fps: float, takes: float) -> list[Hold]:
+    """The holds of each two hands by themselves. metres, close (T, Q, 2, 2), held_on (Q, 2, 2)"""
     found = []
-    for pair, one, other in near.any(dim=0).nonzero().tolist():
-        metres = apart[:, pair, one, other]
-        for start, stop in _bridged(true_runs(near[:, pair, one, other].tolist()), round(BREAK * fps)):
-            held_on = start == 0 and before is not None and bool(before[pair, one, other])
-            if held_on or bool((metres[start:stop] < takes).any()):
-                worth = float((PARTED - metres[start:stop]).clamp_min(0).sum())
+    for pair, one, other in np.argwhere(close.any(axis=0)).tolist():
+        apart = metres[:, pair, one, other]
+        for start, stop in _bridged(true_runs(close[:, pair, one, other]), round(BREAK * fps)):
+            if (start == 0 and held_on[pair, one, other]) or (apart[start:stop] < takes).any():
+                worth = float((PARTED - apart[start:stop]).clip(min=0).sum())
                 found.append(Hold(worth, start, stop, pair, one, other))
     return found
 
@@ -118,10 +126,10 @@ def _bridged(runs: list[tuple[int, int]], gap: int) -> list[tuple[int, int]]:
     return joined
 
 
-def _eased(hold: Hold, frames: int, fps: float) -> Tensor:
+def _eased(hold: Hold, frames: int, fps: float) -> Floats:
     """How far hands follow a hold, 0 to 1, in each of its frames; the first and last of a motion need no easing."""
     count, length = hold.stop - hold.start, max(EASE * fps, 1.0)
-    into = torch.arange(1, count + 1, dtype=torch.float32) / length
-    rise = torch.ones_like(into) if hold.start == 0 else into
-    fall = torch.ones_like(into) if hold.stop == frames else into.flip(0)
-    return smoothstep(torch.minimum(rise, fall).clamp(0, 1))
+    into = np.arange(1, count + 1, dtype=np.float32) / length
+    rise = np.ones_like(into) if hold.start == 0 else into
+    fall = np.ones_like(into) if hold.stop == frames else into[::-1]
+    return smoothstep(torch.from_numpy(np.minimum(rise, fall).clip(0, 1))).numpy()

@@ -19,6 +19,11 @@ def indices(numbers: tuple[int, ...], device: torch.device) -> Tensor:
         return torch.tensor(numbers, device=device)
 
 
+def picked(points: Tensor, joints: tuple[int, ...]) -> Tensor:
+    """Some joints of all. (..., J, 3) -> (..., len(joints), 3)"""
+    return points.index_select(-2, indices(joints, points.device))
+
+
 @functools.cache
 def pairs_of(people: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """The people of each pair, in the order of `combinations`. -> (Q,) x 2"""

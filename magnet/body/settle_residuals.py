@@ -13,9 +13,10 @@ from torch.nn import functional as F
 from magnet.body.capsules import nearest_points
 from magnet.body.energy import Contact, allowed_between_measured, allowed_within, hand_points
 from magnet.body.fitted_capsules import FittedCapsules
-from magnet.body.indices import indices, pairs_of
+from magnet.body.indices import indices, pairs_of, picked
 from magnet.body.joints import FEET, TOES
 from magnet.body.settle_goals import BONES, WEIGHTS, Goals
+from magnet.waiting import constant
 
 NEAR = 0.03
 """Metres short of counting at which capsules are kept: a step may make them count."""
@@ -79,7 +80,7 @@ def unmet(seen: Seen, goals: Goals) -> Residuals:
     lowest, which = height.min(dim=-1)
     foot = feet[which]
     sole = points[goals.float_node, foot]
-    up = rows.along.new_tensor([[0.0, 1.0, 0.0]]).expand(len(foot), 3)
+    up = constant((0.0, 1.0, 0.0), rows.along).expand(len(foot), 3)
     point, other = points[rows.node, rows.place], points[rows.other, rows.other_place]
     value = ((point - other * rows.two[:, None]) * rows.along).sum(-1) - rows.goal
     weight = rows.root_weight
@@ -129,7 +130,7 @@ def swung(joints: Tensor, fps: float, before: Tensor | None = None) -> Tensor:
         fps: frames a second.
         before: (B, 1, P, 22, 3) the frame before; None: there is none.
     """
-    toes = (joints if before is None else torch.cat([before, joints], dim=1))[..., TOES, :][..., [0, 2]]
+    toes = picked(joints if before is None else torch.cat([before, joints], dim=1), TOES)[..., 0:3:2]
     steps = F.pad(toes.diff(dim=1).norm(dim=-1) * fps, (0, 0, 0, 0, int(before is None), 1), value=torch.inf)
     speed = torch.minimum(steps[:, 1:], steps[:, :-1])
     speed = torch.where(speed.isfinite(), speed, 0.0)  # of a single frame nothing is known
@@ -179,7 +180,7 @@ def touching(seen: Seen, capsules: FittedCapsules, goals: Goals, contact: Contac
     if bool(cross.any()):
         pelvis = pelvis.flatten(0, 2)[node[m]] - pelvis.flatten(0, 2)[others[m]]
         axis = one[kept, 1] - one[kept, 0]
-        away = torch.where(cross[:, None], off_axis(pelvis * pelvis.new_tensor([1.0, 0.0, 1.0]), axis), away)
+        away = torch.where(cross[:, None], off_axis(pelvis * constant((1.0, 0.0, 1.0), pelvis), axis), away)
     cost = torch.where(m < count, (WEIGHTS["between"] * goals.settle.hard) ** 0.5, WEIGHTS["within"] ** 0.5).to(depth)
     always = torch.ones_like(depth)
     # The value is the depth; moving along `away` reduces it.

@@ -96,6 +96,11 @@ class Smoothness:
         return (self.cost @ whole.flatten(2).double()).to(offset).view_as(offset) * self.scale
 
     @functools.cached_property
+    def moves(self) -> Tensor:
+        """Whether each node may move. -> (B T P,) bool"""
+        return self.free.diagonal(dim1=2, dim2=3).transpose(1, 2).flatten()
+
+    @functools.cached_property
     def linked(self) -> Tensor:
         """How far a force on a node moves another, times `scale`: 0 between two people. -> (B, T P, T P)"""
         B, P, T, _ = self.undone.shape
@@ -194,11 +199,13 @@ def exact_step(residuals: Residuals, first: Tensor, second: Tensor, smooth: Smoo
     """
     a, b = residuals.node, residuals.other
     free = -smooth.undo(smooth.slope(offset))
+    if not len(a):
+        return free
     flat = free.flatten(0, 2)
     moves = (first * flat[a]).sum(-1) - (second * flat[b]).sum(-1)
-    force = torch.zeros_like(moves)
+    force, ends = torch.zeros_like(moves), Ends.of(residuals, first, second, smooth.moves)
     for group in alike(a // (offset.shape[1] * offset.shape[2]), len(offset)):
-        force[group.rows] = forces(residuals, first, second, moves, smooth, group)
+        force[group.rows] = forces(residuals, ends, moves, smooth, group)
     pull = torch.zeros_like(flat).index_add_(0, a, first * force[:, None]).index_add_(0, b, second * -force[:, None])
     return free - smooth.undo(pull.view_as(offset))
 
@@ -236,31 +243,59 @@ def alike(scene: Tensor, scenes: int) -> Iterator[Group]:
         yield Group(by_scene[begin[few][number] + place], number, place, (len(few), int(count[few].max())))
 
 
-def forces(
-    residuals: Residuals, first: Tensor, second: Tensor, moves: Tensor, smooth: Smoothness, group: Group
-) -> Tensor:
+class Ends(NamedTuple):
+    """The ends of M residuals that a step moves: what is fixed, and a second end on one node, would only cost time.
+
+    In double precision: what nearly cancels, as of a foot that stands, would round to what is not positive.
+    """
+
+    node: Tensor  # (M,) int
+    slope: Tensor  # (M, DOFS)
+    two: Tensor  # (M,) bool, whether another node is moved, too
+    other: Tensor  # (M,) int
+    other_slope: Tensor  # (M, DOFS) 0 where it is not
+
+    @classmethod
+    def of(cls, residuals: Residuals, first: Tensor, second: Tensor, moves: Tensor) -> Ends:
+        """Of residuals and their slopes (M, DOFS) at either end. moves (nodes,) bool, who may move"""
+        node, other, second = residuals.node, residuals.other, second.double()
+        here, same = moves[node], node == other
+        two = here & moves[other] & ~same
+        slope = torch.where(here[:, None], first, 0.0) - torch.where((same | ~here)[:, None], second, 0.0)
+        return cls(torch.where(here, node, other), slope, two, other, torch.where(two[:, None], -second, 0.0))
+
+
+def forces(residuals: Residuals, ends: Ends, moves: Tensor, smooth: Smoothness, group: Group) -> Tensor:
     """How hard the residuals of a group pull. -> (R,)
 
     Args:
-        residuals, first, second, smooth: as for `exact_step`.
+        residuals, smooth: as for `exact_step`.
+        ends: of the residuals.
         moves: (M,) how much the step without residuals changes them, times the square root of the weight.
     """
     M = group.size[1]
-    node = group.each(torch.stack([residuals.node, residuals.other], dim=1)).mT.flatten(1)  # (S, 2 M)
-    slope = group.each(torch.stack([first, -second], dim=1)).transpose(1, 2).flatten(1, 2)
-    linked = smooth.linked.flatten(0, 1)[node]  # (S, 2 M, T P)
-    linked = linked.gather(2, (node % linked.shape[2])[:, None].expand(-1, 2 * M, -1))
-    slope = slope.double()  # what nearly cancels, as of a foot that stands, would round to what is not positive
-    ends = (slope / smooth.scale) @ slope.mT * linked
-    ends = ends[:, :M] + ends[:, M:]
-    gram = ends[..., :M] + ends[..., M:]
+    both = group.each(ends.two).any(dim=0).nonzero()[:, 0]  # (K,) places whose second end moves, too
+    node = torch.cat([group.each(ends.node), group.each(ends.other)[:, both]], dim=1)  # (S, M + K)
+    slope = torch.cat([group.each(ends.slope), group.each(ends.other_slope)[:, both]], dim=1)
+    nodes = smooth.linked.shape[1]
+    linked = smooth.linked.flatten(0, 1)[node].mT  # (S, T P, M + K)
+    linked = linked.flatten(0, 1)[node % nodes + nodes * torch.arange(len(node), device=node.device)[:, None]]
+    gram = ((slope / smooth.scale) @ slope.mT).mul_(linked)
+    gram = gram[:, :M].index_add_(1, both, gram[:, M:])
+    gram = gram[..., :M].index_add_(2, both, gram[..., M:])
     value, weight, free = group.each(residuals.value), group.each(residuals.root_weight), group.each(moves)
     one_sided, moved = group.each(residuals.one_sided), torch.zeros_like(free)
-    eye, divisor = torch.eye(M, dtype=gram.dtype, device=gram.device), weight.clamp_min(1e-12)
+    divisor = weight.clamp_min(1e-12)
     for _ in range(ROUNDS):
         share = torch.where(one_sided, ((value + moved / divisor) / SOFT / 2 + 0.5).clamp(0, 1), 1.0)
-        short = share * (value * weight + free)
-        factor = torch.linalg.cholesky(share[:, :, None] * gram * share[:, None] + eye)
-        force = share * torch.cholesky_solve(short.double()[..., None], factor)[..., 0]
+        counts = share.any(dim=0).nonzero()[:, 0]  # (C,) places; others would only make the matrix larger
+        part = share[:, counts]
+        # Twice by rows, of what is the same across: quicker than by rows and columns.
+        whole = gram.index_select(1, counts).mT.contiguous().index_select(1, counts)
+        whole = whole.mul_(part[:, :, None]).mul_(part[:, None])
+        whole.diagonal(dim1=1, dim2=2).add_(1.0)
+        short = part * (value * weight + free)[:, counts]
+        pull = part * torch.cholesky_solve(short.double()[..., None], torch.linalg.cholesky(whole))[..., 0]
+        force = torch.zeros_like(gram[..., 0]).index_copy_(1, counts, pull)
         moved = free - (gram @ force[..., None])[..., 0].to(free)
     return group.all_of(force.to(moves))

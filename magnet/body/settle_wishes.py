@@ -12,7 +12,7 @@ from magnet.body.base import Body
 from magnet.body.energy import CONTACT, GRAVITY, Contact
 from magnet.body.fit import clearance
 from magnet.body.holding import HELD, holds, lasting_holds
-from magnet.body.indices import pairs_of
+from magnet.body.indices import pairs_of, picked
 from magnet.body.joints import ANKLES, FEET, TOES
 from magnet.body.settle_past import Past
 from magnet.motion.runs import true_runs
@@ -91,7 +91,7 @@ class Wishes:
         above = clearance(body, scene.betas.flatten(0, 1)).unflatten(0, scene.betas.shape[:2])
         there = scene.present[:, None]
         floats = floating(joints, above, scene.fps, past is not None) & there
-        height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)
+        height = (picked(joints, FEET)[..., 1] - above[:, None]).amin(dim=-1)
         joints = joints.clone()
         joints[..., 1] -= torch.where(floats, height, 0.0)[..., None]
         if how == "hold":
@@ -105,9 +105,9 @@ class Wishes:
             behind = lagging(before.plain[:, 0], before.shown[:, 0])
             stays = standing_feet(begin, rest, above, scene.fps, slides)[:, 0] & ~behind
             stands = stands & ~behind[:, None]
-            stood = torch.where(stays[..., None], before.shown[:, 0, :, FEET][..., [0, 2]], torch.nan)
+            stood = torch.where(stays[..., None], picked(before.shown[:, 0], FEET)[..., 0:3:2], torch.nan)
         on = low_toes(joints, above) & there[..., None]
-        kept = torch.maximum(joints[..., TOES, 1], above[:, None, :, [FEET.index(toe) for toe in TOES]])
+        kept = torch.maximum(picked(joints, TOES)[..., 1], above[:, None, :, len(ANKLES) :])
         heights = torch.where(on, kept, torch.nan)
         highest = torch.where(floats, 0.0, torch.where(height > FLOATS, torch.inf, height.clamp_min(LIFTED)))
         return cls(
@@ -157,14 +157,14 @@ def standing(joints: Tensor, above: Tensor, fps: float, slides: float = SLIDES) 
     joints (B, T, P, 22, 3), above (B, P, 4) clearance of the feet's joints
     """
     low = low_toes(joints, above)
-    speed = joints[..., TOES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
+    speed = picked(joints, TOES)[..., 0:3:2].diff(dim=1).norm(dim=-1) * fps
     return low[:, 1:] & low[:, :-1] & (speed < slides)
 
 
 def lagging(joints: Tensor, corrected: Tensor) -> Tensor:
     """Joints of feet that stand too far from under the body, by `LAG`. (B, P, 22, 3) x 2 -> (B, P, 4) bool"""
-    off = (corrected - joints)[..., [0, 2]]
-    far = (off[..., FEET, :] - off[..., :1, :]).norm(dim=-1) > LAG
+    off = (corrected - joints)[..., 0:3:2]
+    far = (picked(off, FEET) - off[..., :1, :]).norm(dim=-1) > LAG
     ankle, toe = far[..., : len(ANKLES)], far[..., len(ANKLES) :]
     return (ankle | toe).repeat(1, 1, 2)
 
@@ -175,16 +175,16 @@ def standing_feet(joints: Tensor, rest: Tensor, above: Tensor, fps: float, slide
     As for `standing`, and rest (B, P, 22, 3) joints of the bodies.
     """
     toes = standing(joints, above, fps, slides)
-    over, flat = (each[..., ANKLES, 1] - each[..., TOES, 1] for each in (joints, rest[:, None]))
+    over, flat = ((picked(each, ANKLES) - picked(each, TOES))[..., 1] for each in (joints, rest[:, None]))
     down = over < flat + RAISED
-    speed = joints[..., ANKLES, :][..., [0, 2]].diff(dim=1).norm(dim=-1) * fps
+    speed = picked(joints, ANKLES)[..., 0:3:2].diff(dim=1).norm(dim=-1) * fps
     return torch.cat([toes & down[:, 1:] & down[:, :-1] & (speed < slides), toes], dim=-1)
 
 
 def low_toes(joints: Tensor, above: Tensor) -> Tensor:
     """Toes on the floor, or under it together with the foot. As for `standing` -> (B, T, P, 2) bool"""
-    lowest = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
-    return joints[..., TOES, 1] - lowest < LOW
+    lowest = (picked(joints, FEET)[..., 1] - above[:, None]).amin(dim=-1, keepdim=True).clamp(max=0.0)
+    return picked(joints, TOES)[..., 1] - lowest < LOW
 
 
 def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> Tensor:
@@ -193,7 +193,7 @@ def floating(joints: Tensor, above: Tensor, fps: float, begun: bool = False) -> 
     Both feet are above `FLOATS`, or above `LIFTED` just before or after. A jump lasts at most 0.8 seconds, and during
     it the mean of the joints accelerates downward by at least half of gravity on average.
     """
-    height = (joints[..., FEET, 1] - above[:, None]).amin(dim=-1)  # (B, T, P)
+    height = (picked(joints, FEET)[..., 1] - above[:, None]).amin(dim=-1)  # (B, T, P)
     up, lifted = height > FLOATS, height > LIFTED
     T = up.shape[1]
     centre = joints[..., :, 1].mean(dim=-1)

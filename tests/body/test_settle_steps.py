@@ -16,7 +16,7 @@ from magnet.body.repair import settling
 from magnet.body.settle import DOFS, SOLVED_AT_ONCE
 from magnet.body.settle_options import Settle
 from magnet.body.settle_residuals import Residuals
-from magnet.body.settle_steps import TOGETHER, Smoothness, alike, exact_step, solve, stiffness
+from magnet.body.settle_steps import TOGETHER, Ends, Smoothness, alike, exact_step, solve, stiffness
 from magnet.generation.live_settling import SHOWN
 from magnet.motion.frames import rigid
 from magnet.motion.rotations import from_rotvec
@@ -188,3 +188,23 @@ def test_many_people_in_a_short_window_are_not_solved_at_once() -> None:
     with unittest.mock.patch("magnet.body.settle.exact_step", side_effect=AssertionError):
         made = settling(crowd, BODY, "firm", settle=replace(SHOWN, iterations=1))
     assert made.isfinite().all()
+
+
+def test_ends_that_cannot_move_and_two_on_one_node_are_left_out() -> None:
+    node, other = torch.tensor([0, 0, 3, 2, 1]), torch.tensor([2, 3, 1, 2, 3])
+    moves = torch.tensor([True, False, True, False])
+    zero = torch.zeros(5, 3)
+    first, second = torch.randn(5, DOFS), torch.randn(5, DOFS)
+
+    def ends_of(one: Tensor, two: Tensor, *slopes: Tensor) -> Ends:
+        residuals = Residuals(one, one, zero, two, two, zero, zero, *(torch.zeros(5),) * 4)
+        return Ends.of(residuals, *slopes, moves)
+
+    ends = ends_of(node, other, first, second)
+    assert ends.two.tolist() == [True, False, False, False, False]
+    assert torch.equal(ends.slope[0], first[0].double()) and torch.equal(ends.other_slope[0], -second[0].double())
+    assert torch.equal(ends.slope[1], first[1].double()) and ends.node.tolist()[:2] == [0, 0]
+    assert torch.equal(ends.slope[3], first[3].double() - second[3].double())
+    assert not ends.other_slope[1:].any()
+    swapped = ends_of(other, node, second, first)
+    assert swapped.node[1] == 0 and torch.equal(swapped.slope[1], -first[1].double())
