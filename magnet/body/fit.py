@@ -52,7 +52,7 @@ class FitSettings:
     learning_rate: float = 0.03
     hint: float = 6.0  # of the squared chordal distance to the start, of joints whose rotation is known
     rest: float = 0.5  # the same of the other joints
-    smooth: float = 20.0  # of squared second differences of rotations (at 30 fps)
+    smooth: float = 20.0  # of squared second differences of rotations, between frames that are 1/30 s apart
     shape: float = 2.0  # of a squared shape number, in the refinement of shapes
     floor: float = 2.0  # of a squared centimetre of a sole under the floor
     shape_prior: float = 0.5  # of a squared shape number, against a square centimetre of a length's error
@@ -145,12 +145,12 @@ def fit_body(
         good = valid.all(dim=1).nonzero()[:, 0] if valid.all(dim=1).any() else torch.arange(T)
         some = good[torch.linspace(0, len(good) - 1, min(settings.shape_frames, len(good))).long()]
         near = None if hints is None else hints[some]
-        few = _Problem(body, targets[some], joints, weights[some], near, settings, 0.0)
+        few = _Problem(body, targets[some], joints, weights[some], near, settings, (0.0, 1))
         R, t, betas = few.solve(betas, settings.shape_steps, fit_shape, lambda done: tell(done, total))
         if grounded:
             found = body.forward_kinematics(R[:, :, 1:], rigid(R[:, :, 0], t), betas)
             floor, soles = float(floor_height(found, body, betas).median()), clearance(body, betas)
-    smooth = settings.smooth * (fps / FPS) ** 4
+    smooth = _smoothness(settings, fps)
     problem = _Problem(body, targets, joints, weights, hints, settings, smooth, floor, soles, _steady(targets, fps))
     R, t, betas = problem.solve(betas, settings.steps, False, lambda done: tell(total - settings.steps + done, total))
     scene = Scene(
@@ -176,10 +176,21 @@ def jumps_in(targets: Tensor, fps: float = FPS) -> Tensor:
     return (targets[2:] - 2 * targets[1:-1] + targets[:-2]).norm(dim=-1).mean(dim=-1) > JUMP * max(FPS / fps, 1.0) ** 2
 
 
+def _smoothness(settings: FitSettings, fps: float) -> tuple[float, int]:
+    """The weight of second differences, and how many frames lie between those that they are taken of.
+
+    Of neighbours at many frames a second it would be thousands, and the descent would not end in its steps.
+    """
+    apart = max(1, round(fps / FPS))
+    return settings.smooth * (fps / apart / FPS) ** 4, apart
+
+
 def _steady(targets: Tensor, fps: float) -> Tensor | None:
-    """Where nobody jumps, as `jumps_in`; None: nowhere does anybody."""
-    jumps = jumps_in(targets, fps)
-    return ~jumps if bool(jumps.any()) else None
+    """Frames (T - 2 apart, P) from which nobody jumps to those `apart` before and after, as `jumps_in`; None: all."""
+    jumps, apart = jumps_in(targets, fps), max(1, round(fps / FPS))
+    if not bool(jumps.any()) or len(targets) <= 2 * apart:
+        return None
+    return ~jumps.unfold(0, 2 * apart - 1, 1).any(dim=-1)
 
 
 def _refuse_bad(residual: Tensor, counts: Tensor, joints: Sequence[int], refuse_above: float) -> None:
@@ -267,10 +278,10 @@ class _Problem:
     weights: Tensor  # (T, P, M)
     hints: Tensor | None  # (T, P, 22, 3, 3)
     settings: FitSettings
-    smooth: float
+    smooth: tuple[float, int]  # as `_smoothness`
     floor: float | None = None  # height in metres, for shapes that are known
     soles: Tensor | None = None  # their `clearance`
-    steady: Tensor | None = None  # (T - 2, P) bool, frames that are to be smooth; None: all
+    steady: Tensor | None = None  # (T - 2 apart, P) bool, frames that are to be smooth; None: all
 
     def solve(
         self, betas: Tensor, steps: int, shape: bool, tell: Callable[[int], None]
@@ -309,13 +320,14 @@ class _Problem:
             height = found[:, :, list(FEET), 1] - self.floor
             deep = (self.soles - height).clamp_min(0.0) / CENTIMETRE
             loss = loss + self.settings.floor * deep.square().sum()
-        if self.smooth and len(R) > 2:
-            turn = R[2:] - 2 * R[1:-1] + R[:-2]
-            bend = (t[2:] - 2 * t[1:-1] + t[:-2]) / CENTIMETRE
+        smooth, s = self.smooth
+        if smooth and len(R) > 2 * s:
+            turn = R[2 * s :] - 2 * R[s:-s] + R[: -2 * s]
+            bend = (t[2 * s :] - 2 * t[s:-s] + t[: -2 * s]) / CENTIMETRE
             if self.steady is not None:
                 turn, bend = turn[self.steady], bend[self.steady]
-            loss = loss + self.smooth * turn.square().sum()
-            loss = loss + self.smooth / 20 * bend.square().sum()
+            loss = loss + smooth * turn.square().sum()
+            loss = loss + smooth / 20 * bend.square().sum()
         return loss
 
 

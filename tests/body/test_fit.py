@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from magnet.datamodules.preparing.fit_cache import LIMBS, fit_whole
 from magnet.datamodules.reading.asf_amc import read_amc, read_asf
 from magnet.datamodules.reading.cmu_joints import measured
 from magnet.motion.frames import rigid
-from magnet.motion.rotations import geodesic
+from magnet.motion.rotations import from_rotvec, geodesic
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from tests.datamodules.slow_cmu import slow_ends
@@ -184,6 +185,37 @@ def test_a_body_that_does_not_fit_is_refused_with_the_worst_joint(body: Body, mo
     targets[:, :, 20] += 3.0
     with pytest.raises(ValueError, match=r"mean error of .* cm, expected at most 4\.0 cm; worst is left_wrist"):
         fit_body(targets, ALL, body, settings=QUICK)
+
+
+def test_many_frames_a_second_fit_as_well_as_thirty(body: Body, generator: torch.Generator) -> None:
+    """At 240 a second smoothness weighed 4,096 times as much between neighbours: joints were thrice as far off."""
+    axes, phases = 0.5 * torch.randn(21, 3, generator=generator), 2 * math.pi * torch.rand(21, 1, generator=generator)
+
+    def off(fps: int) -> float:
+        seconds = torch.arange(fps // 3)[:, None, None] / fps
+        still = random_scene(1, len(seconds), 1, torch.Generator().manual_seed(0))
+        place = torch.cat([seconds[:, 0], torch.ones(len(seconds), 1), torch.zeros(len(seconds), 1)], dim=1)
+        scene = still.replace(
+            body_rot=from_rotvec(axes * (3 * math.pi * seconds + phases).sin())[None, :, None],
+            T_world_root=rigid(torch.eye(3).expand(len(seconds), 3, 3), place)[None, :, None],
+            betas=torch.zeros(1, 1, 10),
+            fps=float(fps),
+            body=body.id,
+        )
+        targets = body.joints(scene)[0]
+        fit = fit_body(targets[:, :, list(MOST)], MOST, body, fps=fps, refuse_above=1.0, settings=QUICK)
+        return float((body.joints(fit.scene)[0] - targets).norm(dim=-1).mean())
+
+    assert off(240) < 1.2 * off(30)
+
+
+def test_a_cut_in_many_frames_a_second_stays_one(body: Body) -> None:
+    scene = random_scene(1, 1, 1, torch.Generator().manual_seed(0)).replace(betas=torch.zeros(1, 1, 10), body=body.id)
+    targets = body.joints(scene)[0].repeat(40, 1, 1, 1)
+    targets[20:, ..., 0] += 1.0
+    fit = fit_body(targets[:, :, list(MOST)], MOST, body, betas=torch.zeros(1, 10), fps=120.0, settings=QUICK)
+    off = fit.residual.mean(dim=(1, 2))
+    assert off[14:26].max() < 1.5 * off[:10].max() + 1e-3
 
 
 def test_what_a_leap_may_be_grows_with_the_time_between_frames() -> None:
