@@ -14,6 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from magnet.export.rig_motion import Floats
 from magnet.files import regular
@@ -23,6 +24,8 @@ from magnet.motion.rotations import from_quat, to_quat
 GLTF = (".glb", ".gltf", ".vrm", ".vrma")
 """Suffixes of glTF: one file; a text with files beside it; VRM's avatars and motions, which say what each bone is."""
 KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+PLACES = {kind: KINDS[kind] for kind in (5121, 5123, 5125)}
+"""Kinds of numbers that count places, of sparse accessors."""
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 PACKED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 """Extensions in which keyframes themselves are compressed."""
@@ -58,28 +61,37 @@ class GltfFile:
     def numbers(self, index: int) -> Floats:
         """An accessor's numbers, whole ones that stand for fractions as such. -> (N, C)"""
         accessor = self.document["accessors"][index]
-        if "sparse" in accessor:
-            raise ValueError("sparse numbers are not read")
-        kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
-        if "bufferView" not in accessor:
-            if not 0 <= accessor["count"] <= MOST_ZEROS:
-                raise IndexError(f"numbers {index} are {accessor['count']} that it does not hold")
-            return np.zeros((accessor["count"], width))
-        view = self.document["bufferViews"][accessor["bufferView"]]
-        begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stride = view.get("byteStride") or width * kind.itemsize
-        data = self._buffer(view["buffer"])
-        try:
-            values = np.ndarray((accessor["count"], width), kind, data, begin, (stride, kind.itemsize))
-        except (ValueError, TypeError, OverflowError) as error:
-            raise IndexError(f"numbers {index} lie outside the file") from error
+        kind, width, count = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]], accessor["count"]
+        if "bufferView" in accessor:
+            held = self._held(index, accessor, kind, count, width)
+        elif 0 <= count <= MOST_ZEROS:
+            held = np.zeros((count, width), kind)
+        else:
+            raise IndexError(f"numbers {index} are {count} that it does not hold")
+        if few := accessor.get("sparse"):  # what differs from the others, and where
+            where = self._held(
+                index, few["indices"], np.dtype(PLACES[few["indices"]["componentType"]]), few["count"], 1
+            )
+            held = held.copy()
+            held[where[:, 0]] = self._held(index, few["values"], kind, few["count"], width)
         with np.errstate(invalid="ignore"):  # NaN of another kind: it is refused below
-            values = values.astype(np.float64)
+            values = held.astype(np.float64)
         if accessor.get("normalized"):
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         if not np.isfinite(values).all():
             raise ValueError("it holds NaN or infinity")
         return values
+
+    def _held(self, index: int, said: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
+        """Numbers (count, width) of a buffer, of which an accessor, or a part of a sparse one, says the place."""
+        view = self.document["bufferViews"][said["bufferView"]]
+        begin = view.get("byteOffset", 0) + said.get("byteOffset", 0)
+        stride = view.get("byteStride") or width * kind.itemsize
+        data = self._buffer(view["buffer"])
+        try:
+            return np.ndarray((count, width), kind, data, begin, (stride, kind.itemsize))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise IndexError(f"numbers {index} lie outside the file") from error
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:

@@ -65,6 +65,43 @@ def test_a_text_with_its_numbers_beside_it_is_the_same_motion(
     assert off(got.scene, couple, body) < 1e-5 and "the body's own skeleton" in got.notes[0]
 
 
+def sparse(glb: Path, component: int, path: Path, base: bool) -> Path:
+    """The same with keyframes that name the numbers that differ from a first array, or from zero."""
+    file = glb_strangers.opened(glb)
+    kind, accessors = {5121: "u1", 5123: "<u2", 5125: "<u4"}[component], file.document["accessors"]
+    for index in {sampler["output"] for clip in file.document["animations"] for sampler in clip["samplers"]}:
+        values, width = GltfFile(glb).numbers(index).astype("<f4"), {"VEC3": 3, "VEC4": 4}[accessors[index]["type"]]
+        plain = np.tile(values[:1], (len(values), 1)) if base else np.zeros_like(values)
+        rows = np.flatnonzero((values != plain).any(axis=1))
+        if not len(rows):
+            continue
+
+        def view(data: bytes) -> int:
+            begin = len(file.binary)
+            file.binary += data + bytes(-len(data) % 4)
+            return file.add("bufferViews", {"buffer": 0, "byteOffset": begin, "byteLength": len(data)})
+
+        said = {"componentType": 5126, "count": len(values), "type": f"VEC{width}"}
+        accessors[index] = said | ({"bufferView": view(plain.tobytes())} if base else {})
+        accessors[index]["sparse"] = {
+            "count": len(rows),
+            "indices": {"bufferView": view(rows.astype(kind).tobytes()), "componentType": component},
+            "values": {"bufferView": view(values[rows].tobytes())},
+        }
+    return file.save(path)
+
+
+@pytest.mark.parametrize("base", [True, False])
+@pytest.mark.parametrize("component", [5121, 5123, 5125])
+def test_keyframes_may_be_sparse(component: int, base: bool, couple: Scene, body: Body, tmp_path: Path) -> None:
+    """They were refused, although the specification has them."""
+    whole = stranger(couple, body, tmp_path / "a.glb")
+    path = sparse(whole, component, tmp_path / "b.glb", base)
+    assert "sparse" in glb_strangers.opened(path).document["accessors"][1]
+    one, other = read(whole).scene, read(path).scene
+    assert torch.equal(one.body_rot, other.body_rot) and torch.equal(one.T_world_root, other.T_world_root)
+
+
 @pytest.mark.parametrize(
     "said", ["../secret.bin", "/etc/hostname", "gone.bin", "http://example.org/a.bin", "a" * 5000, "a%00.bin"]
 )
