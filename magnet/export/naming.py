@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -75,6 +76,26 @@ SCHEMES: dict[str, dict[str, tuple[str, ...]]] = {
         "hip": ("leg",), "knee": ("knee",), "ankle": ("ankle",), "foot": ("toe",), "collar": ("shoulder",),
         "shoulder": ("arm",), "elbow": ("elbow",), "wrist": ("wrist",), "neck": ("neck",), "head": ("head",),
     },
+    "MikuMikuDance in Japanese": {
+        "hip": ("足",), "knee": ("ひざ",), "ankle": ("足首",), "foot": ("つま先", "足先ex"), "collar": ("肩",),
+        "shoulder": ("腕",), "elbow": ("ひじ",), "wrist": ("手首",), "neck": ("首",), "head": ("頭",),
+    },
+    "CAT": {
+        "hip": ("legthigh", "legthigh1", "thigh", "thigh1"), "knee": ("legcalf", "legcalf1", "calf", "calf1"),
+        "ankle": ("legfoot", "legankle", "foot", "ankle"), "foot": ("legtoe1", "legdigit11", "toe1", "toe", "digit11"),
+        "collar": ("armcollarbone", "collarbone"), "shoulder": ("armupperarm", "armupperarm1", "upperarm", "upperarm1"),
+        "elbow": ("armforearm", "armforearm1", "forearm", "forearm1"), "wrist": ("armpalm", "palm"),
+        "neck": ("neck", "neck1"), "head": ("head",),
+    },
+    "Theia": {
+        "hip": ("thigh",), "knee": ("shank",), "ankle": ("foot",), "foot": ("toes",), "shoulder": ("uarm",),
+        "elbow": ("larm",), "wrist": ("hand",), "neck": ("neck",), "head": ("head",),
+    },
+    "German": {
+        "hip": ("oberschenkel",), "knee": ("unterschenkel",), "ankle": ("fuss", "fuß"),
+        "collar": ("schulter",), "shoulder": ("oberarm",), "elbow": ("unterarm",), "wrist": ("hand",),
+        "neck": ("hals",), "head": ("kopf",),
+    },
     "no one program": {
         "knee": ("knee", "shin", "calf", "lowerleg", "lowleg", "leg", "legstretch"),
         "hip": ("upleg", "upperleg", "thigh", "hip", "leg", "thighstretch"),
@@ -96,6 +117,9 @@ PREFIX = re.compile(r"(?i)^(bip\d+|mixamorig\d*|skeleton\d*|character\d*|def|org
 NUMBERED, MOST = re.compile(r"_(\d+)$"), 0.8
 """The number of a node behind a joint's name, and the share of names that end in another one each where it is that; or
 that begin or end with the same word where it says nothing."""
+BEGUN = re.compile(r"(?<=[a-z])(?=[A-Z])")
+"""Where a word begins in a name without spaces, such as FredLThigh or mHipLeft."""
+SIDES = {"左": "left", "右": "right"}
 FIRST, LAST = re.compile(r"[^ _.\-]+[ _.\-]+(?=.)"), re.compile(r"[ _.\-]+[^ _.\-]+$")
 SIGNS = {"CMU": "left:hipjoint"}
 """A joint that identifies a scheme whose other names also occur in another scheme."""
@@ -174,7 +198,16 @@ def plain(names: Sequence[str]) -> list[str]:
         before, short = short, [PREFIX.sub("", name) for name in short]
         for word in (FIRST, LAST):
             short = _without_shared(short, word)
-    return short
+    return _without_character(short)
+
+
+def _without_character(names: Sequence[str]) -> list[str]:
+    """Names without the longest beginning up to a capital that most share, as of CAT's and of Second Life's joints."""
+    begins = Counter(name[: found.start()] for name in names for found in BEGUN.finditer(name))
+    shared = [each for each, count in begins.items() if count >= MOST * len(names)]
+    if not shared:
+        return list(names)
+    return [name.removeprefix(max(shared, key=len)) for name in names]
 
 
 def _without_shared(names: Sequence[str], word: re.Pattern[str]) -> list[str]:
@@ -192,7 +225,11 @@ def split_side(name: str) -> tuple[str, set[str]]:
     "LeftUpLeg", "upleg_l", "L UpLeg" and "lUpLeg" all give ("left", {"left:upleg"}); a name that merely begins with
     an l or r, such as "lowerback", may also be taken whole, and has side "?".
     """
-    letters = re.sub(r"[^0-9a-z]", "", name.lower())
+    name = unicodedata.normalize("NFKC", name)
+    letters = re.sub(r"[\W_]", "", name.lower())
+    if name[:1] in SIDES:
+        side = SIDES[name[0]]
+        return side, {f"{side}:{letters[1:]}"}
     for side in ("left", "right"):
         if letters.startswith(side):
             return side, {f"{side}:{letters[len(side) :]}"}
