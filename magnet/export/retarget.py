@@ -282,7 +282,8 @@ def hints(skeleton: Skeleton, rest: Tensor) -> tuple[Tensor, dict[int, int]]:
     aligned, source = rests_aligned(skeleton, rest), sources(skeleton)
     known = torch.full((skeleton.file.frames, BODY_JOINTS, 3, 3), torch.nan, dtype=torch.float64)
     for j, k in source.items():
-        known[:, j] = torch.from_numpy(skeleton.turned[:, k]) @ aligned[j]
+        whole = skeleton.carrier(j) if j in skeleton.naming.joints else k
+        known[:, j] = torch.from_numpy(skeleton.turned[:, whole]) @ aligned[j]
     return known, source
 
 

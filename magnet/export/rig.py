@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magnet.body.joints import HIPS, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS
+from magnet.body.joints import (  # isort: skip
+    ANKLES, ELBOWS, HIPS, KNEES, L_ANKLE, L_ELBOW, L_FOOT, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, SHOULDERS, WRISTS,
+)  # fmt: skip
 from magnet.export.naming import Naming, recognised
 from magnet.export.rig_motion import RigMotion
 from magnet.export.upright import WARNING, Stance, agreed, said, stance, told_against
@@ -31,6 +33,8 @@ UP: dict[str, Floats] = {
 }
 """Up axis of a file: the rotation that takes its world to ours."""
 
+ENDS = dict(zip((*HIPS, *KNEES, *SHOULDERS, *ELBOWS), (*KNEES, *ANKLES, *ELBOWS, *WRISTS), strict=True))
+"""Joints at which limbs begin and end that may turn in several parts."""
 LIMBS = ((L_HIP, L_KNEE), (L_KNEE, L_ANKLE), (L_ANKLE, L_FOOT), (L_SHOULDER, L_ELBOW), (L_ELBOW, L_WRIST))
 """Left joint and the child that says where its bone points in the rest pose."""
 
@@ -49,6 +53,14 @@ class Skeleton:
     at: Floats  # (T, K, 3) world positions, metres, y up
     chain: tuple[int, ...]  # numbers of the pelvis, the spine and the chest, upwards
     notes: tuple[str, ...] = ()  # doubts about unit and axis, and how they were decided
+
+    def carrier(self, joint: int) -> int:
+        """Which of its joints turns a limb of ours whole: the last of those that share its turns.
+
+        Daz's shoulder bends, a twist on it rolls the arm, and the elbow hangs on that; MakeHuman's limbs are two parts.
+        """
+        first, end = self.naming.joints[joint], self.naming.joints.get(ENDS.get(joint, -1))
+        return first if end is None or first not in _line(self.file.parents, end)[1:] else self.file.parents[end]
 
 
 def require_unit(unit: str | None) -> None:
