@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +66,10 @@ def read_glb(path: str | Path, start: int = 0, end: int | None = None, clip: str
         tracks, notes = _tracks(file, clip)
         at, fps, also = _clock([track for (node, _), track in tracks.items() if _moves(file, node, people)])
         kept = kept_frames(path, len(at), start, end)
-        world = _World(file, tracks, at[kept])
-        return [_person(file, world, joints, fps, (*notes, *also), len(people) > 1) for joints in people]
+        world, first = _World(file, tracks, at[kept]), _World(file, tracks, at[:1])
+        rigs = [_person(file, world, joints, fps, (*notes, *also), len(people) > 1) for joints in people]
+        same = [_rests_as(file, first, joints) for joints in people]
+        return [replace(rig, posed=is_same and len(at) > 1) for rig, is_same in zip(rigs, same, strict=True)]
 
 
 @contextmanager
@@ -274,6 +276,14 @@ def _person(
     names = tuple(map(file.name, joints))
     told: dict[str, Any] = {"up": "y", "unit": "m", "person": person, "notes": tuple(notes)}
     return RigMotion(names, tuple(nearest), offsets, place, local, fps, file.path, **told)
+
+
+def _rests_as(file: GltfFile, first: _World, joints: Sequence[int]) -> bool:
+    """Whether nodes without a skin rest as they are in the first frame: they were written as they were just then."""
+    skins = file.document.get("skins", [])
+    if any("inverseBindMatrices" in skin and set(joints) & set(skin["joints"]) for skin in skins):
+        return False
+    return all(np.allclose(first(node)[0], file.at_rest(node), rtol=1e-4, atol=1e-4) for node in joints)
 
 
 def _named(file: GltfFile, joints: Sequence[int]) -> str:

@@ -26,7 +26,7 @@ from magnet.export.bones import bone_names
 from magnet.export.bvh import offsets_of
 from magnet.export.cutting import require_one_clock, require_one_rate, together
 from magnet.export.read_options import Reading
-from magnet.export.rests import rests_aligned
+from magnet.export.rests import rests_aligned, with_doubts
 from magnet.export.rig import Skeleton, people_of, require_unit, require_up, understood_together
 from magnet.export.rig_files import read_rigs
 from magnet.motion.frames import rigid
@@ -138,7 +138,7 @@ def load_rigs(paths: str | Path | Sequence[str | Path], body: Body, **said: Any)
     up = options.up or (prescribed.pop() if len(prescribed) == 1 else None)
     for file in files:
         file.require_near()
-    skeletons = understood_together(files, options.unit, up, options.joints)
+    skeletons = with_doubts(understood_together(files, options.unit, up, options.joints))
     read = [onto(skeleton, body, most_shape=MOST_SHAPE) for skeleton in skeletons]  # what models take
     jumps = [tuple(start + frame for frame in _jumps(each)) for each in skeletons]
     sources = tuple(replace(source, jumps=found) for (_, source), found in zip(read, jumps, strict=True))

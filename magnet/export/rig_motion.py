@@ -37,6 +37,7 @@ class RigMotion:
     unit: str | None = None  # the format's, which programs do not all keep; None: any
     person: str = ""  # who it is, in a file of several people
     notes: tuple[str, ...] = ()  # on how it was read
+    posed: bool = False  # its rest pose is a pose of the motion, so that it tells nothing of how people rest
 
     @property
     def label(self) -> str:

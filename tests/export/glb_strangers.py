@@ -53,6 +53,20 @@ def opened(path: Path) -> Written:
     return glb
 
 
+def frozen(path: Path) -> Path:
+    """The same file with nodes that rest as they are in the first key of its animations."""
+    glb = opened(path)
+    for clip in glb.document["animations"]:
+        for channel in clip["channels"]:
+            accessor = glb.document["accessors"][clip["samplers"][channel["sampler"]]["output"]]
+            begin = glb.document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+            width = {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+            node = glb.document["nodes"][channel["target"]["node"]]
+            node.pop("matrix", None)
+            node[channel["target"]["path"]] = np.frombuffer(glb.binary, "<f4", width, begin).tolist()
+    return glb.save(path)
+
+
 def parts(matrix: Floats) -> tuple[Floats, Floats, Floats]:
     """Translation, quaternion and scale of a transform (..., 4, 4)."""
     scale = np.linalg.norm(matrix[..., :3, :3], axis=-2)

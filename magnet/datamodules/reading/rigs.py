@@ -16,6 +16,7 @@ from magnet.body import Body
 from magnet.body.joints import HEAD, JOINT_NAMES, NECK, PELVIS
 from magnet.datamodules.reading.own import OwnReader
 from magnet.datamodules.reading.recording import Axis, DataError, Family, Recording, signed
+from magnet.export.rests import with_doubts
 from magnet.export.retarget import TARGETS, onto
 from magnet.export.rig import UP, Skeleton, understood_together
 from magnet.export.rig_motion import RigMotion
@@ -129,7 +130,7 @@ class RigReader(OwnReader[RigTrack]):
         self, where: str, tracks: Sequence[RigTrack], names: Sequence[str], notes: Sequence[str]
     ) -> Recording:
         """Skeletons, and the joints by which axis, unit and rate are checked."""
-        skeletons = _skeletons(tracks)
+        skeletons = with_doubts(_skeletons(tracks))
         differ = len({skeleton.up for skeleton in skeletons}) > 1
         if differ:  # no one axis is all files': everybody is turned to y up by that of the own file
             tracks = [replace(track, up=one.up) for track, one in zip(tracks, skeletons, strict=True)]
