@@ -21,7 +21,7 @@ from magnet.body.joints import PARENTS
 from magnet.export.drawing import STYLES, Style
 from magnet.export.glb import unbroken
 from magnet.export.page.marks import marked
-from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, pale
+from magnet.export.page.palette import COLLIDES, GHOST, SLIDES, TOUCHES, agent_colours, dim, pale
 from magnet.export.page.rig import Rig, bone_poses, first_style, rigs
 from magnet.export.page.takes import ShownTake, in_a_row, numbered, same_length, take, takes, titled
 from magnet.files import write_text
@@ -29,7 +29,7 @@ from magnet.motion.scene import Scene
 
 CODES = {"int16": "i16", "uint16": "u16", "uint32": "u32", "uint8": "u8", "float32": "f32"}
 FULL = 32767
-SCRIPTS = ("motion.js", "marks.js", "picture.js", "player.js")
+SCRIPTS = ("motion.js", "marks.js", "picture.js", "camera.js", "player.js")
 CHUNK = 512
 """Frames posed at a time."""
 
@@ -155,10 +155,11 @@ def _contents(
 def _people(group: ShownTake, number: int, ghosts: bool) -> list[dict[str, Any]]:
     """Facts about the people of a take."""
     colours = np.array([GHOST] * len(group.slots), dtype=np.uint8) if ghosts else agent_colours(group.slots)
-    paler = colours if ghosts else pale(colours)
+    inks = {"colour": colours, "pale": colours if ghosts else pale(colours), "dim": colours if ghosts else dim(colours)}
     return [
-        {"take": number, "name": f"person {slot + 1}", "colour": own.tolist(), "pale": light.tolist(), "ghost": ghosts}
-        for slot, own, light in zip(group.slots, colours, paler, strict=True)
+        {"take": number, "name": f"person {slot + 1}", "ghost": ghosts}
+        | {name: ink[row].tolist() for name, ink in inks.items()}
+        for row, slot in enumerate(group.slots)
     ]
 
 

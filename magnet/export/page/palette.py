@@ -1,4 +1,4 @@
-"""Colours of people: those of the pictures, paler where motion was given to the model."""
+"""Colours of people: those of the pictures, nearer to the background where motion was given to the model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from magnet.export.drawing import AGENTS, TILES
 
 PALENESS = 0.58
-"""How far the colour of given motion lies towards white."""
+"""How far the colour of given motion lies towards white, or on a dark page towards `DUSK`."""
+DUSK = (46, 51, 62)
+"""Towards which colours are dim: not black, so that limbs are told from a dark floor."""
 
 GHOST = (150, 156, 168)
 STANDS = (20, 160, 110)
@@ -36,6 +38,11 @@ def hexed(colour: Sequence[int] | Colours) -> str:
 def pale(colours: Colours, share: float = PALENESS) -> Colours:
     """Colours of given motion. (..., 3)"""
     return (colours + share * (255.0 - colours)).round().astype(np.uint8)
+
+
+def dim(colours: Colours, share: float = PALENESS) -> Colours:
+    """Colours of given motion on a dark page, where pale people would be what is seen first. (..., 3)"""
+    return (colours + share * (np.array(DUSK) - colours.astype(float))).round().astype(np.uint8)
 
 
 def for_batches(colours: Colours | NDArray[np.floating]) -> Colours:

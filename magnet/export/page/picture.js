@@ -3,6 +3,7 @@
 // The vertex shader finds the vertex at rest and its normal in a texture of all shapes, and the bones of its person
 // in a texture of all poses.
 
+const DARK = matchMedia("screen and (prefers-color-scheme: dark)"); // as the page's colours ask
 const FIELD = 0.62; // vertical angle of view, radians
 const LIGHT = unit([-0.15, 0.9, 0.62]);
 const WIDE = 2048; // texels in a row of the shapes' texture, which every browser has room for
@@ -60,18 +61,19 @@ uniform float alpha;
 uniform vec3 eye;
 uniform vec3 light;
 uniform bool shadow;
+uniform vec3 shade;
 out vec4 ink;
 void main() {
-  if (shadow) { ink = vec4(0.20, 0.23, 0.32, alpha); return; }
+  if (shadow) { ink = vec4(shade, alpha); return; }
   vec3 n = normalize(facing);
   vec3 toEye = normalize(eye - at);
   float toward = dot(n, light);
   float diffuse = max(0.30 + 0.70 * toward, 0.0);
   float rim = pow(1.0 - max(dot(n, toEye), 0.0), 3.0);
-  float shade = 0.44 + 0.62 * diffuse + 0.14 * (0.5 + 0.5 * n.y) - 0.10 * rim;
+  float lit = 0.44 + 0.62 * diffuse + 0.14 * (0.5 + 0.5 * n.y) - 0.10 * rim;
   float gloss = pow(max(dot(reflect(-light, n), toEye), 0.0), 24.0);
-  float pale = clamp(shade - 0.92, 0.0, 0.5) * 0.8 + 0.14 * gloss;
-  ink = vec4(mix(colour * min(shade, 1.0), vec3(1.0), pale), alpha);
+  float pale = clamp(lit - 0.92, 0.0, 0.5) * 0.8 + 0.14 * gloss;
+  ink = vec4(mix(colour * min(lit, 1.0), vec3(1.0), pale), alpha);
 }`;
 
 const FLOOR_VERTEX = `#version 300 es
@@ -90,6 +92,8 @@ precision highp float;
 in vec2 at;
 uniform vec3 centre;
 uniform float reach;
+uniform vec3 tiles[2];
+uniform vec3 far;
 out vec4 ink;
 void main() {
   vec2 tile = at / 0.5;
@@ -97,9 +101,9 @@ void main() {
   // The share of a pixel that lies on odd tiles: a triangle wave, limited where it would flicker.
   vec2 wave = clamp((abs(fract(tile * 0.5) - 0.5) - 0.25) / blur * 2.0 + 0.5, 0.0, 1.0);
   float odd = mix(wave.x + wave.y - 2.0 * wave.x * wave.y, 0.5, clamp(max(blur.x, blur.y) - 0.5, 0.0, 1.0));
-  vec3 colour = mix(vec3(0.937, 0.945, 0.961), vec3(0.886, 0.902, 0.929), odd);
+  vec3 colour = mix(tiles[0], tiles[1], odd);
   float away = length(at - centre.xz) / reach;
-  ink = vec4(mix(colour, vec3(0.980, 0.980, 0.988), clamp(away * away - 0.1, 0.0, 1.0)), 1.0);
+  ink = vec4(mix(colour, far, clamp(away * away - 0.1, 0.0, 1.0)), 1.0);
 }`;
 
 class Picture {
@@ -124,7 +128,18 @@ class Picture {
     this.marks = new Marks(this, meta, arrays);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-    gl.clearColor(0.98, 0.98, 0.988, 1);
+    this.theme(DARK.matches);
+  }
+
+  // The colours of a light page or a dark one, where shadows are deeper and given people dim, not pale.
+  theme(dark) {
+    const style = getComputedStyle(document.documentElement);
+    const read = (name) => style.getPropertyValue(name).match(/[0-9a-f]{2}/gi).map((part) => parseInt(part, 16) / 255);
+    this.far = read("--far");
+    this.tiles = new Float32Array([...read("--tile"), ...read("--other")]);
+    [this.shade, this.shadow] = dark ? [[0, 0, 0], 0.5] : [[0.2, 0.23, 0.32], 0.2];
+    this.faint = dark ? "dim" : "pale";
+    this.gl.clearColor(...this.far, 1);
   }
 
   program(vertex, fragment) {
@@ -218,6 +233,7 @@ class Picture {
     gl.uniform3fv(uniforms.light, LIGHT);
     gl.uniform3fv(uniforms.eye, eye);
     gl.uniform1f(uniforms.unit, this.meta.unit);
+    gl.uniform3fv(uniforms.shade, this.shade);
     gl.uniform1i(uniforms.poses, 0);
     gl.uniform1i(uniforms.shapes, 1);
     this.pose(motion, time, view);
@@ -233,9 +249,9 @@ class Picture {
     const gl = this.gl;
     const frame = Math.min(Math.floor(time), this.meta.frames - 1);
     const people = view.ghosts ? [...view.shown, ...view.behind] : view.shown;
-    for (const [row, { index, shape, colour, pale }] of people.entries()) {
+    for (const [row, { index, shape, colour, [this.faint]: faint }] of people.entries()) {
       this.rows.set(motion.pose(index, time), row * ROWS * 4);
-      const tint = view.given(frame, index) ? pale : colour;
+      const tint = view.given(frame, index) ? faint : colour;
       this.about.set([row, shape, tint[0] / 255, tint[1] / 255, tint[2] / 255], row * ABOUT);
     }
     gl.activeTexture(gl.TEXTURE0);
@@ -252,6 +268,8 @@ class Picture {
     gl.uniformMatrix4fv(uniforms.camera, false, this.camera);
     gl.uniform3fv(uniforms.centre, view.target);
     gl.uniform1f(uniforms.reach, Math.max(5, 1.8 * view.distance));
+    gl.uniform3fv(uniforms.tiles, this.tiles);
+    gl.uniform3fv(uniforms.far, this.far);
     gl.bindVertexArray(this.quad);
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
@@ -265,7 +283,7 @@ class Picture {
     gl.enable(gl.BLEND);
     gl.depthMask(false);
     gl.uniform1i(this.people.uniforms.shadow, 1);
-    this.figures(0, count, style, 0.2);
+    this.figures(0, count, style, this.shadow);
     gl.uniform1i(this.people.uniforms.shadow, 0);
     gl.depthMask(true);
     gl.disable(gl.BLEND);

@@ -1,145 +1,10 @@
-// The camera and the controls: plays people from the two elements #meta (JSON) and #data (base64).
+// The clock and the controls: plays people from the two elements #meta (JSON) and #data (base64).
 
-const PRESETS = { "three quarters": [0.65, 0.3], front: [0, 0.12], side: [Math.PI / 2, 0.12], above: [0, 1.45] };
-const ALL = -1; // takes, side by side
 const HEAD_HIGH = 2.3; // metres, where a take's label is
-const DEPTHS = 5; // pixels of the timeline's stripe of depths
-const FARTHEST = 80; // metres that the camera may be away
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const ZOOMS = { "+": 0.87, "=": 0.87, "-": 1.15, "_": 1.15 };
 const MOMENTS = 21; // at which is measured how much room people take
-
-// A stripe of the timeline: a background of CSS with a colour for each frame.
-function stripe(frames, colour, top, height) {
-  const stops = [];
-  for (let from = 0, to; from < frames; from = to) {
-    const ink = colour(from);
-    for (to = from + 1; to < frames && colour(to) === ink; ) to++;
-    stops.push(`${ink} ${(100 * from) / frames}% ${(100 * to) / frames}%`);
-  }
-  return `linear-gradient(90deg, ${stops.join(", ")}) 0 ${top}px / 100% ${height}px no-repeat`;
-}
-
-// -- camera -------------------------------------------------------------------------------------
-
-class View {
-  constructor(canvas, meta, arrays) {
-    this.known = arrays.known; // (T, M)
-    this.anyGiven = this.known.some((given) => given);
-    this.people = meta.people.map((person, index) => ({ ...person, index }));
-    this.style = meta.styles[0];
-    this.ghosts = true;
-    this.marks = true;
-    this.follow = true;
-    this.target = [0, 0.85, 0];
-    this.preset(meta.takes.length > 1 ? "front" : "three quarters");
-    this.choose(ALL);
-    this.listen(canvas);
-  }
-
-  // Look at one take, or at all side by side.
-  choose(take) {
-    this.take = take;
-    const there = this.people.filter((person) => take === ALL || person.take === take);
-    this.shown = there.filter((person) => !person.ghost);
-    this.behind = there.filter((person) => person.ghost);
-  }
-
-  given(frame, person) {
-    return this.known[frame * this.people.length + person] > 0;
-  }
-
-  // Whose motion was given in a frame; nothing where none at all was.
-  said(frame, people) {
-    if (!this.anyGiven) return "";
-    const those = people.filter((person) => this.given(frame, person.index));
-    if (those.length === people.length) return "given";
-    return those.length ? `given: ${those.map((person) => person.name).join(", ")}` : "generated";
-  }
-
-  // A stripe a person for the timeline, pale where the motion was given, and below them one of how deep people are in
-  // each other, if they are: backgrounds of CSS, and their height.
-  ribbon(frames, marks) {
-    const people = Math.min(24, Math.max(6, 4 * this.shown.length));
-    const each = people / this.shown.length;
-    const stripes = this.shown.map((person, row) => {
-      const colour = (frame) => `rgb(${this.given(frame, person.index) ? person.pale : person.colour})`;
-      return stripe(frames, colour, row * each, each);
-    });
-    const depths = Array.from({ length: frames }, (_, frame) => (this.marks ? marks.deepest(frame, this.take) : 0));
-    if (!depths.some((depth) => depth > 0)) return [stripes.join(", "), `${people}px`];
-    const deep = (frame) => (depths[frame] ? `rgb(${marks.depthColour(depths[frame])})` : "#e8ebf1");
-    stripes.push(stripe(frames, deep, people + 1, DEPTHS));
-    return [stripes.join(", "), `${people + 1 + DEPTHS}px`];
-  }
-
-  preset(name) {
-    [this.azimuth, this.elevation] = PRESETS[name];
-  }
-
-  eye() {
-    const flat = this.distance * Math.cos(this.elevation);
-    return [
-      this.target[0] + flat * Math.sin(this.azimuth),
-      this.target[1] + this.distance * Math.sin(this.elevation),
-      this.target[2] + flat * Math.cos(this.azimuth),
-    ];
-  }
-
-  goTo(centre, share) {
-    this.target[0] += share * (centre[0] - this.target[0]);
-    this.target[2] += share * (centre[2] - this.target[2]);
-  }
-
-  turn(dx, dy) {
-    this.azimuth -= 0.008 * dx;
-    this.elevation = Math.min(Math.max(this.elevation + 0.006 * dy, -0.05), 1.5);
-  }
-
-  move(dx, dy) {
-    const scale = 0.0016 * this.distance;
-    this.target[0] -= scale * dx * Math.cos(this.azimuth);
-    this.target[2] += scale * dx * Math.sin(this.azimuth);
-    this.target[1] = Math.min(Math.max(this.target[1] + scale * dy, 0), 3);
-  }
-
-  zoom(factor) {
-    this.distance = Math.min(Math.max(this.distance * factor, 0.8), FARTHEST);
-  }
-
-  // One finger or the left button turns, the right button or shift moves, two fingers or the wheel zoom.
-  listen(canvas) {
-    const touching = new Map();
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(Math.exp(0.001 * event.deltaY));
-    }, { passive: false });
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      touching.set(event.pointerId, event);
-    });
-    for (const name of ["pointerup", "pointercancel"])
-      canvas.addEventListener(name, (event) => touching.delete(event.pointerId));
-    canvas.addEventListener("pointermove", (event) => {
-      const before = touching.get(event.pointerId);
-      if (!before) return;
-      const [dx, dy] = [event.clientX - before.clientX, event.clientY - before.clientY];
-      if (touching.size === 2) {
-        const other = [...touching.values()].find((each) => each.pointerId !== event.pointerId);
-        const span = (each) => Math.hypot(each.clientX - other.clientX, each.clientY - other.clientY) || 1;
-        this.zoom(span(before) / span(event));
-      } else if (event.shiftKey || event.buttons & 2) {
-        this.follow = false;
-        document.getElementById("follow").checked = false;
-        this.move(dx, dy);
-      } else this.turn(dx, dy);
-      touching.set(event.pointerId, event);
-    });
-  }
-}
-
-// -- playing ------------------------------------------------------------------------------------
+const WAKES = ["input", "change", "click", "keydown", "pointerdown", "pointermove", "pointerup", "wheel"];
 
 class Player {
   constructor({ meta, arrays }) {
@@ -159,13 +24,46 @@ class Player {
     this.choose(ALL);
     const middles = this.labels.map((_, take) => this.centre(this.view.shown.filter((person) => person.take === take)));
     this.apart = Math.min(...middles.slice(1).map((middle, take) => middle[0] - middles[take][0])); // metres
+    this.wakeful();
+  }
+
+  // What may change the picture, whoever's event it is.
+  wakeful() {
+    for (const name of WAKES) document.addEventListener(name, () => this.wake(), { capture: true, passive: true });
+    DARK.addEventListener("change", () => this.theme());
+    new ResizeObserver(() => this.wake()).observe(this.picture.canvas);
+    this.theme();
+    this.wake();
+  }
+
+  // Play, or draw what has changed, and then rest: a page that stands still asks nothing of the processor.
+  wake() {
+    if (this.awake) return;
+    this.awake = true;
     let last = performance.now();
     const tick = (now) => {
-      if (this.seen) this.advance(Math.max(0, now - last) / 1000); // the first one may lie before the page was ready
+      const moved = this.seen && this.advance(Math.max(0, now - last) / 1000); // the first one may lie before `last`
       last = now;
-      requestAnimationFrame(tick);
+      this.awake = moved || (this.seen && this.playing);
+      if (this.awake) requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
+  }
+
+  // Dress for a light page or a dark one, at once: a page that is printed is not drawn again by and by.
+  theme() {
+    const { picture, view } = this;
+    picture.theme(DARK.matches);
+    document.getElementById("givens").replaceChildren();
+    if (view.anyGiven) this.entry("givens", `${picture.faint}: given`, this.faint());
+    this.ribbon();
+    this.advance(0);
+  }
+
+  // The inks of given motion, side by side.
+  faint() {
+    const inks = this.view.people.filter((person) => !person.ghost).map((person) => `rgb(${person[this.picture.faint]})`);
+    return `linear-gradient(90deg, ${inks[0]} 50%, ${inks[1] ?? inks[0]} 50%)`;
   }
 
   get frame() {
@@ -210,34 +108,52 @@ class Player {
 
   ribbon() {
     const { style } = document.getElementById("time");
-    [style.background, style.height] = this.view.ribbon(this.meta.frames, this.picture.marks);
+    [style.background, style.height] = this.view.ribbon(this.meta.frames, this.picture.marks, this.picture.faint);
   }
 
+  // Let time pass, and draw if that, or anything since, changes what is seen. -> whether it did
   advance(seconds) {
+    const { meta, view } = this;
     if (this.playing) {
-      this.time += seconds * this.meta.fps * this.speed;
-      if (this.time > this.meta.frames - 1) {
-        if (this.loop) this.time = 0;
+      this.time += seconds * meta.fps * this.speed;
+      if (this.time >= meta.frames) {
+        if (this.loop) this.time %= meta.frames; // the last frame is seen as long as the others
         else {
-          this.time = this.meta.frames - 1;
+          this.time = meta.frames - 1;
           this.play(false);
         }
       }
     }
-    if (this.view.follow) this.view.goTo(this.centre(), Math.min(1, 4 * seconds));
-    this.picture.draw(this.motion, this.time, this.view);
+    if (view.follow) view.goTo(this.centre(), Math.min(1, 4 * seconds));
+    const look = this.look();
+    if (look === this.looked) return false;
+    this.looked = look;
+    this.picture.draw(this.motion, this.time, view);
     this.drawn += 1;
     this.show();
+    return true;
+  }
+
+  // All that the picture depends on, in one line; a place to a tenth of a millimetre, so that the camera arrives.
+  look() {
+    const { view, picture } = this;
+    const { clientWidth, clientHeight } = picture.canvas;
+    const place = view.target.map((x) => x.toFixed(4));
+    const angles = [view.azimuth, view.elevation, view.distance];
+    const chosen = [view.take, view.style, view.ghosts, view.marks, picture.faint, this.playing, this.time];
+    return [...place, ...angles, ...chosen, clientWidth, clientHeight, window.devicePixelRatio].join();
   }
 
   play(on) {
     if (on && this.frame >= this.meta.frames - 1) this.time = 0;
     this.playing = on;
+    this.wake();
   }
 
   seek(frame) {
     this.playing = false;
     this.time = Math.min(Math.max(frame, 0), this.meta.frames - 1);
+    this.wake();
   }
 
   show() {
@@ -245,7 +161,7 @@ class Player {
     const get = (id) => document.getElementById(id);
     get("play").textContent = this.playing ? "Pause" : "Play";
     get("time").value = frame;
-    get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s / ${((meta.frames - 1) / meta.fps).toFixed(1)} s`;
+    get("clock").textContent = `${(frame / meta.fps).toFixed(2)} s of ${(meta.frames / meta.fps).toFixed(1)} s`;
     const alone = meta.takes.length === 1 || this.view.take !== ALL;
     get("state").textContent = alone ? this.said(this.view.shown, this.view.take) : "";
     get("time").ariaValueText = [get("clock").textContent, get("state").textContent].filter((text) => text).join(", ");
@@ -284,6 +200,13 @@ class Player {
     return this.picture.onPage([x, HEAD_HIGH, z]);
   }
 
+  // A line of a legend: words after a dot of their ink.
+  entry(id, words, ink) {
+    const entry = document.getElementById(id).appendChild(document.createElement("span"));
+    entry.textContent = words;
+    entry.style.setProperty("--ink", ink);
+  }
+
   controls() {
     const get = (id) => document.getElementById(id);
     const { meta, view } = this;
@@ -305,11 +228,7 @@ class Player {
     get("ghosts").hidden = !meta.people.some((person) => person.ghost);
     get("truth").addEventListener("change", (event) => (view.ghosts = event.target.checked));
     get("marked").hidden = !this.picture.marks.kinds.size;
-    for (const [words, ink] of this.picture.marks.legend()) {
-      const entry = get("legend").appendChild(document.createElement("span"));
-      entry.textContent = words;
-      entry.style.setProperty("--ink", ink);
-    }
+    for (const [words, ink] of this.picture.marks.legend()) this.entry("legend", words, ink);
     get("marks").addEventListener("change", (event) => {
       view.marks = event.target.checked;
       get("legend").hidden = !view.marks;
@@ -351,5 +270,6 @@ new IntersectionObserver((changes) => {
   const seen = changes.at(-1).isIntersecting;
   if (window.player) player.seen = seen;
   else if (seen) begin();
+  if (seen) window.player?.wake();
   if (seen && window.player && player.picture.gl.isContextLost()) location.reload();
 }).observe(document.body);
