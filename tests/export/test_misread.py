@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import pytest
@@ -18,7 +17,8 @@ from magnet.generation.inputs import check_given
 from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import Scene, cat_agents, cat_time, concatenate, empty_scene
 from magnet.sampling.options import SamplerOptions
-from magnet.testing import random_scene, tiny_denoiser
+from magnet.testing import tiny_denoiser
+from tests.counting import Counting
 
 DUET = Scene.load(checkpoints.FOLDER / "duet" / "scenes" / "duet.npz").replace(given=None, names=())
 FRAMES = 32
@@ -150,17 +150,21 @@ def counted(scene: Scene) -> Tensor:
     return torch.ones(scene.frames // 4, scene.agents, dtype=torch.bool)
 
 
-def test_the_check_takes_a_few_milliseconds_however_long_the_scene_is() -> None:
-    scene = random_scene(1, 3000, 4, torch.Generator().manual_seed(0))
-    known = counted(scene)
+@pytest.mark.parametrize("lie", [False, True], ids=["who stand", "who lie"])
+def test_the_check_looks_at_no_more_bodies_however_long_the_scene_is(lie: bool) -> None:
+    def looked(times: int) -> tuple[int, int]:
+        """Operators that the check runs beyond those that `any_floor` leaves, and the numbers that these make."""
+        scene = cat_time([beside(lying(0.0), lying(0.0), 0.7) if lie else DUET.slice(0, FRAMES)] * times)
+        with Counting() as whole:
+            check_given(scene, counted(scene))
+        with Counting() as without:
+            check_given(scene, counted(scene), any_floor=True)
+        return whole.operators - without.operators, whole.numbers - without.numbers
 
-    def took(any_floor: bool) -> float:
-        begun = time.process_time()
-        check_given(scene, known, any_floor)
-        return time.process_time() - begun
-
-    took(False)
-    assert min(took(False) for _ in range(5)) - min(took(True) for _ in range(5)) < 0.05
+    looked(1)  # what is made once
+    (few, less), (many, more) = looked(10), looked(100)
+    assert few == many and less < 1_500_000
+    assert more - less < 50 * 90 * FRAMES  # who is known when, but no pose, which has 205 numbers a frame and person
 
 
 def test_of_several_scenes_the_one_is_named_that_is_strange() -> None:
