@@ -17,6 +17,7 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from magnet.cli.errors import KINDS, wrong_value
 from magnet.cli.flags import chosen_flags, class_in_flags, closest, refused
+from magnet.cli.lone_numbers import in_lists, lists_of
 from magnet.cli.named_files import unquoted
 from magnet.cli.option_places import as_key, flat_key, in_files, no_class, place_of, with_place
 from magnet.cli.unknown_classes import no_such_class
@@ -93,7 +94,16 @@ class Parser(LightningArgumentParser):
                     ActionConfigFile.apply_config(self, namespace, "config", layer)
             except TypeError as error:
                 self.error(str(error), error)
+        args = None if args is None else in_lists(args, self._takes_list)
         return super().parse_args(args, namespace, **kwargs)
+
+    def _takes_list(self, flag: str) -> bool:
+        """Whether an option of the command, or of a class that is chosen, takes a list of whole numbers."""
+        flag = flag.replace(".init_args.", ".", 1)
+        key = flag.lstrip("-").partition(".")[0]
+        path = self.chosen.get(key) or (self._default_path(key) if key in self.classes else "")
+        kind = self.classes.get(key, {}).get(path.rpartition(".")[2])
+        return flag in (_lists(key, kind) if kind else lists_of(self._actions))
 
     def format_help(self, *args: Any, **kwargs: Any) -> str:
         """Options of every run and the list of topics; or the options of one topic; or all of them."""
@@ -155,10 +165,15 @@ class Parser(LightningArgumentParser):
     def _name_choices(self, key: str) -> None:
         """Give a group a heading with the names to choose from, instead of class paths and the base class's text."""
         group, action = option(self, key)
-        path = (action.default.get("class_path") or action.default["name"]) if action.default else ""
+        path = self._default_path(key)
         default = f"; default: {path.rpartition('.')[2]}" if path else ""
         group.title, action.help = f"--{key} NAME", argparse.SUPPRESS
         group.description = f"One of {', '.join(self.classes[key])}{default}. Fields are --{key}.FIELD VALUE."
+
+    def _default_path(self, key: str) -> str:
+        """The class under a key where nobody names one, as a dotted path or a task's name; empty if there is none."""
+        _, action = option(self, key)
+        return (action.default.get("class_path") or action.default["name"]) if action.default else ""
 
     def explain(self, key: str, value: str, text: str) -> None:
         """Set the help of an option that Lightning or the parser has made."""
@@ -286,6 +301,14 @@ def _topic_of(group: Any) -> str:
     """The topic of help that a group of options belongs to; empty for what every run has."""
     flags = [flag for action in group._group_actions for flag in action.option_strings]
     return next((name for name in ("trainer", "sampler") if any(flag.startswith(f"--{name}") for flag in flags)), "")
+
+
+@functools.cache
+def _lists(key: str, kind: type) -> frozenset[str]:
+    """Options of a class, with dashes, that take a list of whole numbers."""
+    parser = LightningArgumentParser()
+    parser.add_class_arguments(kind, key, fail_untyped=False)
+    return lists_of(parser._actions)
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from magnet.checks import require_whole
 from magnet.cli.config_files import Layer
 from magnet.cli.errors import CommandError, no_such, wrong_value
 from magnet.cli.flags import flat, of_preset, taken_out
+from magnet.cli.lone_numbers import in_lists, lists_of
 from magnet.plugins import Registered, summary, told
 from magnet.tasks import Task, registry
 from magnet.tasks.base import fault_of, schedule_of
@@ -125,6 +126,7 @@ def read_fields(
                     if f"task.{name}" not in cfg:
                         raise CommandError(unknown_option(parser, f"--task.{name}", more))
                     cfg[f"task.{name}"] = part
+        flags = in_lists(flags, lists_of(parser._actions).__contains__)
         return dict(parser.parse_args(flags, namespace=cfg).as_dict())
     except ArgumentError as error:
         message = str(error)
