@@ -1,6 +1,6 @@
-"""The message between agents, version 1: what docs/agents.md describes, as bytes and back, and nothing of the network.
+"""The message between agents, version 2: what docs/agents.md describes, as bytes and back, and nothing of the network.
 
-Five parts: topic, header (JSON), poses, token, checksum. Another layout is another version.
+Five parts: topic, header (JSON), poses, token, checksum. Another layout is another version, and so is a field more.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any, Literal, NoReturn
 
 import numpy as np
 
-VERSION = 1
+VERSION = 2
+"""It was 1 before a header had `lags`."""
 JOINTS = 21
 POSE = 3 + 4 + 4 * JOINTS
 """Numbers of a pose: the pelvis's place and rotation, and the rotation of each body joint; quaternions as x y z w."""
@@ -109,8 +110,6 @@ def unpack(parts: Sequence[bytes]) -> Message:
     if sealed(parts[:4])[4] != parts[4]:
         raise RefusedMessage("checksum")
     header = _header(parts[1])
-    if header["v"] != VERSION:
-        raise RefusedMessage("version")
     count = _whole(header["count"], 0, TOKEN)
     kind = header["kind"]
     if kind not in ("frames", "hello") or (count == 0) != (kind == "hello"):
@@ -141,6 +140,8 @@ def _header(text: bytes) -> dict[str, Any]:
         header = json.loads(text.decode(), parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         raise RefusedMessage("header") from error
+    if isinstance(header, dict) and "v" in header and header["v"] != VERSION:  # whose other fields may be others
+        raise RefusedMessage("version")
     if not isinstance(header, dict) or header.keys() - {LAGS} != KEYS:
         raise RefusedMessage("header")
     return header

@@ -17,7 +17,7 @@ LATE = 2.0
 WHY = {
     "size": f"of more or fewer than five parts, or over {LARGEST} bytes",
     "checksum": "that do not come as they were sent",
-    "version": f"of another version than {VERSION}",
+    "version": f"of another version than {VERSION}: take the same release of magnet for all",
     "header": "whose header lacks a field, has another, or holds what it cannot",
     "kind": "that are neither frames nor a hello",
     "topic": "whose topic is not their sender's",

@@ -72,7 +72,7 @@ def told(number: int, value: float) -> list[bytes]:
 
 
 WRONG = {
-    "version": [changed(v=2), changed(v="1")],
+    "version": [changed(v=1), changed(v=3), changed(v="1")],
     "header": [
         changed(extra=1),
         changed(lags=[]), changed(lags={"A": "late"}), changed(lags={"A": None}), changed(lags={65 * "A": 0.1}),

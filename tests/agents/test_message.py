@@ -17,7 +17,7 @@ from magnet.agents.message import Message, RefusedMessage, pack, sealed, unpack
 POSES = np.linspace(-2, 2, 4 * 91, dtype=np.float32).reshape(4, 91)
 TOKEN = np.linspace(-1, 1, 70, dtype=np.float32)
 FIELDS: dict[str, Any] = {
-    "v": 1, "kind": "frames", "agent": "B", "sender": "Zo\u00eb", "session": 7, "frame": 8, "count": 4, "clock": 1.5,
+    "v": 2, "kind": "frames", "agent": "B", "sender": "Zo\u00eb", "session": 7, "frame": 8, "count": 4, "clock": 1.5,
     "betas": [0.5] * 10, "model": "feed", "heard": ["A"],
 }  # fmt: skip
 SENT = Message("frames", "B", "Zo\u00eb", 7, 8, 1.5, (0.5,) * 10, POSES, "feed", TOKEN, ("A",))
@@ -64,6 +64,16 @@ def test_what_is_written_as_documented_is_read() -> None:
     assert same(bare, replace(SENT, poses=POSES[:2], model="", token=None, frame=10))
     hello = unpack(by_hand(POSES[:0], np.zeros(0), kind="hello", model="", frame=-1))
     assert same(hello, replace(SENT, kind="hello", poses=POSES[:0], model="", token=None, frame=-1))
+
+
+def test_another_version_is_told_as_that_whatever_fields_it_has() -> None:
+    plain = by_hand(POSES[:0], np.zeros(0), kind="hello", model="", frame=-1)
+    assert unpack(plain).kind == "hello"
+    for fields in ({"v": 1}, {"v": 3, "mood": "fine"}, {"v": "2"}):
+        with pytest.raises(RefusedMessage, match=r"^version$"):
+            unpack(by_hand(POSES[:0], np.zeros(0), **{"kind": "hello", "model": "", "frame": -1} | fields))
+    with pytest.raises(RefusedMessage, match=r"^header$"):
+        unpack(by_hand(mood="fine"))
 
 
 RANGES: dict[str, tuple[list[Any], list[Any]]] = {
