@@ -91,11 +91,12 @@ format: $(READY)  ## rewrite the code in the project's style
 	@$(PY) -m ruff check --fix .
 	@$(PY) -m ruff format .
 
-docs: $(READY)  ## the documentation as a site in site/; a broken link is an error
+docs: $(READY)  ## the documentation as a site in site/, served at SITE_URL if that is given; a broken link is an error
 	@echo "docs: mkdocs, strict; the tour is run for it, a minute"
 	@$(PY) -m pip install -qq --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[docs]'
-	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build -q
-	@echo "docs: open site/index.html, or $(PY) -m http.server -d site"
+	@NO_MKDOCS_2_WARNING=1 SITE_URL='$(SITE_URL)' $(PY) -m mkdocs build -q
+	@echo "docs: open site/index.html, or $(PY) -m http.server -d site; for an address like https://host/magnet/," \
+	  "make docs SITE_URL=that, or links of 404.html lead to https://host/"
 
 wheel: $(READY)  ## the wheel and the source archive in dist/, with this Python's recorded answers
 	@echo "wheel: answers of --help are made for it, half a minute"

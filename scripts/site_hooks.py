@@ -36,6 +36,13 @@ ELSEWHERE = {
 FOLDERS = {"examples/magnet-duel": "examples/magnet-duel/README.md"}
 UNLISTED = ("open_body.md", "plugin.md", "own_people.md")
 """Pages that others link to and that the navigation leaves out."""
+STYLES = {
+    # On a phone the theme breaks names anywhere; a table may be wider than the page, and is moved by a finger. The
+    # head of a table without one is an empty row.
+    "site.css": ".md-typeset td code, .md-typeset th code { word-break: normal; }\n"
+    ".md-typeset table:not([class]) th:empty { padding: 0; border: 0; }\n"
+}
+"""What the theme lacks, as `extra_css` names it."""
 FRAMES = 60
 """Frames a scene of the tour has on the site; MAGNET_TOUR_FRAMES=150 gives what the notebook says."""
 SCENES = {"duet": "two people, from nothing", "quartet": "four people, from nothing"}
@@ -88,7 +95,7 @@ def on_files(files: Any, config: Any) -> Any:
         add(uri, text + players(brought) if uri == "index.md" else text)
     for path in sorted((ROOT / "docs").glob("*.md")):
         moved(path.read_text(encoding="utf-8"), f"docs/{path.name}", path.name, brought)  # what its links bring along
-    for uri, text in reference():
+    for uri, text in [*reference(), *STYLES.items()]:
         add(uri, text)
     for uri, data in brought.items():
         add(uri, data)

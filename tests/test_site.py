@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -39,3 +40,10 @@ def test_a_site_with_a_picture_that_is_not_there_is_refused(hooks: ModuleType, t
     (tmp_path / "index.html").write_text('<iframe src="plan.png"></iframe><img src="pictures/plan.png">')
     with pytest.raises(FileNotFoundError, match=r"^index\.html: pictures/plan\.png$"):
         hooks.on_post_build(site)
+
+
+def test_styles_that_the_site_asks_for_are_made_and_its_404_page_knows_where_it_is_served(hooks: ModuleType) -> None:
+    said = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert re.findall(r"^extra_css: \[(.*?)\]", said, re.MULTILINE) == [", ".join(hooks.STYLES)]
+    assert re.search(r"^site_url: !ENV \[SITE_URL, \"\"\]", said, re.MULTILINE)
+    assert "SITE_URL='$(SITE_URL)'" in (ROOT / "Makefile").read_text(encoding="utf-8")
