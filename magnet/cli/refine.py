@@ -85,12 +85,12 @@ def main(arguments: Sequence[str] = ()) -> int:
     if options.shapes:
         got = replace(got, scene=with_shapes(got.scene, shapes_of(options, how_lent, got), got.body))
     fixed = fixed_agents(got.scene, options.keep)
+    print(f"before {refine_shown.told(before, got.body)}", flush=True)  # correcting may take minutes
     if options.poses == "keep":
         refined = moved_apart(got.scene, got.body, APART[options.apart], fixed)
     else:
         refined = repaired(got.scene, got.body, how, fixed, slides=options.slides)
-    for title, scene in (("before", before), ("after", refined)):
-        print(f"{title:7}{refine_shown.told(scene, got.body)}")
+    print(f"after  {refine_shown.told(refined, got.body)}")
     refine_shown.name_left(refined, got.body)
     scene_files.say_written(formats.write(refined, out, got.body, progress=True))
     if options.plot:

@@ -51,6 +51,20 @@ def test_people_are_out_of_each_other_afterwards_and_the_table_says_so(crowded: 
     assert torch.allclose(made.T_world_root[..., 1, 3], crowded.T_world_root[..., 1, 3]), "and heights"
 
 
+def test_how_it_was_is_said_before_the_correction_which_takes_long(
+    crowded: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = []
+
+    def corrected(scene: Scene, *_: object) -> Scene:
+        said.append(capsys.readouterr().out)
+        return scene
+
+    monkeypatch.setattr("magnet.body.repair.moved_apart", corrected)
+    assert cli.main(["refine", str(crowded.save(tmp_path / "a.npz")), str(tmp_path / "b.npz"), "--poses", "keep"]) == 0
+    assert len(said) == 1 and said[0].startswith("before ") and capsys.readouterr().out.startswith("after ")
+
+
 def test_limbs_that_stay_in_each_other_are_named_with_people_and_frames(
     crowded: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
