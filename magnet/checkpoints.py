@@ -23,6 +23,7 @@ from safetensors.torch import load_file
 from safetensors.torch import save as serialized
 from torch import Tensor
 
+from magnet.extras import installing
 from magnet.files import file_hash, inside, sync, write_whole, writing
 from magnet.old_names import renamed_checkpoint
 
@@ -89,7 +90,7 @@ def from_hub(name: str) -> Path:
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
-        raise ImportError('models of a hub need huggingface_hub: pip install "magnet-motion[hub]"') from error
+        raise ImportError(f"models of a hub need huggingface_hub: {installing('hub')}") from error
     try:
         folder = Path(snapshot_download(match[1], revision=match[2], allow_patterns=HUB_FILES))
     except Exception as error:  # the hub's own, the network's and the disk's

@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from magnet.agents.message import LARGEST, PARTS, VERSION
+from magnet.extras import installing
 
 QUEUE = 64
 """Messages that wait for somebody who does not read; after that they are lost."""
@@ -34,7 +35,7 @@ def engine() -> ModuleType:
     try:
         import zmq
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError('agents need ZeroMQ: pip install "magnet-motion[agents]"') from error
+        raise ModuleNotFoundError(f"agents need ZeroMQ: {installing('agents')}") from error
     return zmq
 
 

@@ -17,6 +17,7 @@ from typing import Literal
 from magnet import plugins
 from magnet.cli import answers
 from magnet.cli.flags import PlainParser
+from magnet.extras import installing
 from magnet.version import __version__
 
 State = Literal["ok", "missing", "wrong"]
@@ -29,7 +30,7 @@ BAD_LIGHTNING = ("2.6.2", "2.6.3")
 
 @dataclass(frozen=True)
 class Extra:
-    """What `pip install "magnet-motion[NAME]"` adds: the distributions that it needs, and what they are for."""
+    """What `installing` NAME adds: the distributions that it needs, and what they are for."""
 
     needs: tuple[str, ...]
     adds: str
@@ -137,8 +138,7 @@ def extras() -> Iterator[Finding]:
         versions = {each: version_of(each) for each in extra.needs}
         lacking = [each for each, version in versions.items() if version is None]
         if lacking:
-            advice = f'pip install "magnet-motion[{name}]"'
-            yield Finding("extras", name, "missing", extra.adds, advice)
+            yield Finding("extras", name, "missing", extra.adds, installing(name))
         else:
             there = ", ".join(f"{each} {version}" for each, version in versions.items())
             yield Finding("extras", name, "ok", f"{extra.adds} ({there})")

@@ -11,6 +11,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from lightning.pytorch.loggers.logger import rank_zero_experiment
 
 from magnet.cli.errors import CommandError
+from magnet.extras import installing
 
 
 class Curves(CSVLogger):
@@ -67,7 +68,7 @@ def loggers(folder: Path, chosen: Any, wandb: str | None, fit: bool, goes_on: bo
 
 def _wandb(folder: Path, offline: bool) -> Logger:
     if find_spec("wandb") is None:
-        raise CommandError('--wandb needs the package wandb: pip install "magnet-motion[wandb]"')
+        raise CommandError(f"--wandb needs the package wandb: {installing('wandb')}")
     folder.mkdir(parents=True, exist_ok=True)
     label = f"{folder.parent.name}/{folder.name}"
     return WandbLogger(project="magnet", name=label, save_dir=str(folder), offline=offline)

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from magnet.denoiser.core import DenoiserCore
+from magnet.extras import installing
 from magnet.files import suffixed, write_whole
 from magnet.motion.scene import FPS
 from magnet.motion.tokens import TOKEN_FRAMES, by_frame, by_token, pairwise_by_frame, pairwise_by_token
@@ -37,7 +38,6 @@ from magnet.version import __version__
 
 OPSET = 18
 """Of the files: ONNX 1.13 of December 2022 and later read it."""
-NEEDS = 'ONNX files need onnx, onnxruntime and onnxscript: pip install "magnet-motion[onnx]"'
 MOST_OFF = 1e-4
 """Largest difference between a file's numbers, by onnxruntime, and the model's that is let pass."""
 
@@ -179,7 +179,7 @@ def _traced(network: nn.Module, inputs: Mapping[str, Tensor], outputs: list[str]
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401  torch's exporter is written in it
     except ImportError as error:
-        raise ImportError(NEEDS) from error
+        raise ImportError(f"ONNX files need onnx, onnxruntime and onnxscript: {installing('onnx')}") from error
     free = torch.export.Dim("B", min=1)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it tells of operators that no part of this has
     with warnings.catch_warnings():

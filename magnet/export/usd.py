@@ -18,17 +18,17 @@ from magnet.body.joints import PARENTS
 from magnet.export.bones import BoneOptions, bone_names
 from magnet.export.drawing import AGENTS
 from magnet.export.glb import INFLUENCES, influences, linear, moved, slots_to_write, standing, standing_vertices
+from magnet.extras import installing
 from magnet.files import whole
 from magnet.motion.scene import Scene
 
-NEEDS = '.usda, .usdc and .usdz need usd-core: pip install "magnet-motion[usd]"'
 ROOT = "root"
 
 
 def require_usd() -> None:
     """Refuse where usd-core is not installed."""
     if importlib.util.find_spec("pxr") is None:
-        raise ImportError(NEEDS)
+        raise ImportError(f".usda, .usdc and .usdz need usd-core: {installing('usd')}")
 
 
 def save_usd(scene: Scene, path: str | Path, body: Body, bones: BoneOptions = BoneOptions()) -> Path:

@@ -31,6 +31,7 @@ from magnet.export.drawing import (
     require_size,
 )
 from magnet.export.figures import add_ghosts, add_shadows
+from magnet.extras import installing
 from magnet.files import whole
 from magnet.motion.scene import FPS, Scene
 
@@ -229,7 +230,7 @@ def _frames(film: Film, report: Report, shown: Sequence[int] | None = None) -> I
 def require_av() -> None:
     """Refuse where PyAV is not installed."""
     if importlib.util.find_spec("av") is None:
-        raise ImportError('.mp4 needs PyAV: pip install "magnet-motion[video]"; .gif and .webp do not')
+        raise ImportError(f".mp4 needs PyAV: {installing('video')}; .gif and .webp do not")
 
 
 def _write_mp4(film: Film, path: Path, report: Report) -> None:

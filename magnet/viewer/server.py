@@ -19,6 +19,8 @@ from urllib.parse import urlsplit
 
 import rich
 
+from magnet.extras import installing
+
 AT_ONCE = "Object.defineProperty(document, 'hidden', {configurable: true, get: () => true})"
 TOGETHER = f'<img src="data:," alt="" style="display:none" onerror="{AT_ONCE}">'
 """Lets viser's page (1.1) take up what it is sent at once, as it does in tabs that are out of sight.
@@ -39,7 +41,6 @@ TOLD = 15.0
 """Seconds that an error message stays visible."""
 LONG = 60
 """Letters of a wrong value that are repeated."""
-NEEDS = 'the viewer needs viser: pip install "magnet-motion[view]"'
 
 
 def start(host: str, port: int, title: str) -> Any:
@@ -234,7 +235,7 @@ def require_viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise ImportError(NEEDS) from error
+        raise ImportError(f"the viewer needs viser: {installing('view')}") from error
     return viser
 
 

@@ -16,6 +16,7 @@ from magnet.cli.view_shown import sampler_options
 from magnet.datamodules.fakes.body import write_body
 from magnet.export import save_bvh
 from magnet.export.drawing import STYLES
+from magnet.extras import installing
 from magnet.motion.scene import Scene
 from magnet.sampling.options import SamplerOptions
 from magnet.testing import tiny_denoiser
@@ -60,7 +61,7 @@ def test_without_viser_it_says_what_to_install(monkeypatch, capsys, words) -> No
         return real(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    assert 'pip install "magnet-motion[view]"' in said(capsys, *words)
+    assert installing("view") in said(capsys, *words)
 
 
 def test_nothing_to_watch_and_contradictions_are_named(capsys) -> None:
