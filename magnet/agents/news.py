@@ -47,6 +47,7 @@ class News:
         self._jumped: float | None = None
         self._gone: set[str] = set()
         self._looked: float | None = None
+        self._refused: set[str] = set()
         self._late: dict[str, float] = {}  # who is heard late, and since when; or when that was said
         self._said: set[tuple[str, str]] = set()
 
@@ -97,7 +98,17 @@ class News:
 
     def refused(self, peer: str, reason: str) -> None:
         """A message was."""
+        self._refused.add(peer)
         self._once(peer, reason, f"messages of {peer} are refused ({reason}): {WHY.get(reason, 'of another form')}")
+
+    def ends(self, unheard: Collection[str]) -> None:
+        """It is over, and nothing of these has been taken."""
+        for refused, line in (
+            (False, "never heard {}: are addresses and keys theirs?"),
+            (True, "never took anything of {}: their messages were refused"),
+        ):
+            if names := sorted(name for name in unheard if (name in self._refused) == refused):
+                self.say(line.format(", ".join(names)))
 
     def of_other_weights(self, name: str) -> None:
         """Somebody's tokens are not understood."""

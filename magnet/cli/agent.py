@@ -195,8 +195,7 @@ def take_part(given: argparse.Namespace, member: Member, link: Link, others: set
     print(f"magnet agent: {given.name} is at {given.listen}   (Ctrl+C ends it)", file=sys.stderr, flush=True)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(None if given.seconds is None else round(given.seconds / PERIOD))
-    if process.unheard:
-        print(f"magnet: never heard {', '.join(process.unheard)}: are addresses and keys theirs?", file=sys.stderr)
+    process.news.ends(process.unheard)
     if lag := process.report.lag():
         print(f"magnet: {lag}", file=sys.stderr)
     report = process.report.told(member, gate, process.pace) | {"closed": dict(link.closed)}

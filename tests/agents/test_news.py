@@ -126,3 +126,18 @@ def test_an_agent_says_that_somebody_runs_other_weights(own: str, said: bool):
     for frame in (4, 8):
         hears(line, process, (name, pack(dataclasses.replace(sent, frame=frame))))
     assert heard == ["A runs other weights: its poses are read, and not its tokens"] * said
+
+
+def test_at_the_end_it_says_of_whom_nothing_came_and_of_whom_nothing_was_taken():
+    process, _ = third(Line([("A", pack(Message("hello", "A", "A", 1, -1, 0.0)))]))
+    said = saying(process)
+    process.news.ends([])
+    process.news.refused("C", "version")
+    process.news.ends(["A", "B", "C"])
+    assert said[1:] == [
+        "never heard A, B: are addresses and keys theirs?",
+        "never took anything of C: their messages were refused",
+    ]
+    said.clear()
+    process.news.ends(["C"])
+    assert said == ["never took anything of C: their messages were refused"]
