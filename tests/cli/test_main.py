@@ -221,8 +221,8 @@ def test_help_is_by_topic_and_no_topic_takes_three_hundred_lines(
                 "--sampler.pyramid_offset: got four, expected a whole number or null",
             ),
             (
-                ["test", "--task", "inbetweening", "--task.keys", "20"],
-                "--task.keys: got 20, expected a list such as [0,1]",
+                ["test", "--task", "inbetweening", "--task.keys", "20,30"],
+                "--task.keys: got 20,30, expected a list such as [0,1]",
             ),
             (["fit", "--model", "ToyModel", "--data.window_frames", "63"], "63, which is not a multiple of 4"),
             (["fit", "--model", "ToyModel", "--model.max_agents", "3"], "set --data.max_agents"),
