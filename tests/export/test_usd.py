@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from magnet.export.bones import BoneOptions
 from magnet.export.drawing import AGENTS
 from magnet.export.glb import linear
 from magnet.export.usd import joint_paths, save_usd
+from magnet.extras import installing
 from magnet.testing import random_scene
 
 
@@ -106,7 +108,7 @@ def test_people_keep_their_numbers(body: Body, tmp_path: Path) -> None:
 
 def test_without_the_package_the_extra_is_named(body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(ImportError, match=r"pip install \"magnet-motion\[usd\]\""):
+    with pytest.raises(ImportError, match=re.escape(installing("usd"))):
         save_usd(random_scene(1, 4, 1, torch.Generator().manual_seed(4)), tmp_path / "a.usda", body)
 
 

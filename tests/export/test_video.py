@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ from magnet.export.drawing import (
     strokes,
 )
 from magnet.export.video import Film, stamp
+from magnet.extras import installing
 from magnet.motion.scene import Scene
 from magnet.testing import random_scene
 from tests.cases import some_slow
@@ -255,7 +257,7 @@ def test_mp4_without_pyav_names_the_fix(
     duet: Scene, body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ImportError, match=r"magnet-motion\[video\]"):
+    with pytest.raises(ImportError, match=re.escape(installing("video"))):
         render_video(duet, tmp_path / "a.mp4", context_frames=4, body=body, size=SMALL)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import hashlib
 import json
+import re
 import shutil
 import sys
 import threading
@@ -18,6 +19,7 @@ import pytest
 
 import magnet
 from magnet import checkpoints
+from magnet.extras import installing
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 OTHERS = ("scenes", "README.md")
@@ -74,7 +76,7 @@ def test_what_cannot_be_had_is_said_in_a_line(hub: list[dict[str, Any]], name: s
 
 def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match=r"pip install \"magnet-motion\[hub\]\""):
+    with pytest.raises(ImportError, match=re.escape(installing("hub"))):
         magnet.load("hub:somebody/duet")
 
 
