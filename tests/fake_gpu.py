@@ -136,7 +136,8 @@ class OnGpu(Tensor):
         return memo[id(self)]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        _SAVED.add(self.held.untyped_storage()._cdata)
+        storage = self.held.untyped_storage()
+        _SAVED[storage._cdata] = storage
         return self._like(self.held.detach()).__reduce_ex__(protocol)
 
     def _like(self, made: Tensor) -> Tensor:
@@ -144,8 +145,9 @@ class OnGpu(Tensor):
         return torch.nn.Parameter(made, self.requires_grad) if getattr(self, "_is_param", False) else made
 
 
-_SAVED: set[int] = set()
-"""Storages that are written as those of a GPU; without `map_location` nothing reads them."""
+_SAVED: dict[int, torch.UntypedStorage] = {}
+"""Storages that are written as those of a GPU, by address, and kept, or another would come to lie there; without
+`map_location` nothing reads them."""
 
 torch.serialization.register_package(1, lambda each: "cuda:0" if each._cdata in _SAVED else None, lambda *_: None)
 
@@ -388,4 +390,5 @@ def fake_gpu(traced: bool = False) -> Iterator[Seen]:
             yield seen
     finally:
         torch.__future__.set_swap_module_params_on_conversion(swaps)
+        _SAVED.clear()
         seen = before

@@ -102,6 +102,15 @@ def test_the_fake_counts_waits() -> None:
         assert seen.sent == 2
 
 
+def test_what_is_saved_behind_the_fake_is_of_the_processor(tmp_path: Path) -> None:
+    with fake_gpu():
+        torch.save([torch.ones(1000, device="cuda") for _ in range(50)], tmp_path / "there.pt")
+        torch.save([torch.ones(1000) for _ in range(50)], tmp_path / "beside.pt")
+    torch.save([torch.ones(1000) for _ in range(50)], tmp_path / "behind.pt")
+    for name in ("beside", "behind"):
+        assert all(not each.is_cuda for each in torch.load(tmp_path / f"{name}.pt"))
+
+
 # -- sampling ----------------------------------------------------------------------------------
 
 
