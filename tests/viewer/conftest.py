@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from magnet.body import Body, load_body
+from magnet.extras import installing
 from magnet.generation.live import Live
 from magnet.motion.scene import Scene
 from magnet.synthesis.generate import synthesize
@@ -68,7 +69,7 @@ def app(body: Body, handshake: Scene) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     """Debian's Chromium, driven by Playwright, with a profile of its own."""
-    api = pytest.importorskip("playwright.sync_api", reason='needs playwright: pip install "magnet-motion[browser]"')
+    api = pytest.importorskip("playwright.sync_api", reason=f"needs playwright: {installing('browser')}")
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if path is None:
         pytest.skip("needs Chromium: apt-get install chromium")

@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from magnet.body.indices import indices
 from magnet.body.mirror import mirror_scene
 from magnet.datamodules.clip import Clip, Ints
 from magnet.motion.frames import from_planar
@@ -262,7 +261,7 @@ def place_apart(
         (B, T, P, 4, 4) in the first group's world.
     """
     yaw, direction, distance = relative_pose.unbind(-1)
-    ground = T_world_root[..., indices((0, 2), T_world_root.device), 3]
+    ground = T_world_root[..., 0:3:2, 3]
     ours, theirs = present & ~second, present & second
 
     def centre(group: Tensor) -> Tensor:
