@@ -76,11 +76,19 @@ def elbow_roll(skeleton: Skeleton, s: int, ahead: Tensor, least: float = 0.2) ->
 
     least: mean share of the forearm that is aside of the upper arm.
     """
+    upper, bends = bent_aside(skeleton, SHOULDERS[s], ELBOWS[s], WRISTS[s])
+    return about(upper, ahead, bends) if float(bends.norm()) >= least else 0.0
+
+
+def bent_aside(skeleton: Skeleton, upper: int, hinge: int, end: int) -> tuple[Tensor, Tensor]:
+    """Where the upper bone of a limb rests, of unit length, and where the lower one goes aside of it. -> (3,) x 2
+
+    The second is the mean of unit directions over all frames, as the upper bone rests; upper, hinge and end are joints
+    of ours.
+    """
     ours, rest = skeleton.naming.joints, torch.from_numpy(skeleton.file.rest())
-    shoulder, elbow, wrist = (ours[joints[s]] for joints in (SHOULDERS, ELBOWS, WRISTS))
-    lower = torch.from_numpy(skeleton.at[:, wrist] - skeleton.at[:, elbow])
-    turned = torch.from_numpy(skeleton.turned[:, skeleton.carrier(SHOULDERS[s])])
+    bone = torch.nn.functional.normalize(rest[ours[hinge]] - rest[ours[upper]], dim=0)
+    lower = torch.from_numpy(skeleton.at[:, ours[end]] - skeleton.at[:, ours[hinge]])
+    turned = torch.from_numpy(skeleton.turned[:, skeleton.carrier(upper)])
     lower = torch.nn.functional.normalize((turned.mT @ lower[..., None])[..., 0], dim=-1)
-    bone = torch.nn.functional.normalize(rest[elbow] - rest[shoulder], dim=0)
-    bends = (lower - (lower @ bone)[..., None] * bone).mean(dim=0)
-    return about(bone, ahead, bends) if float(bends.norm()) >= least else 0.0
+    return bone, (lower - (lower @ bone)[..., None] * bone).mean(dim=0)

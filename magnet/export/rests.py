@@ -15,7 +15,7 @@ from magnet.body.joints import (  # isort: skip
     ANKLES, ELBOWS, HIPS, KNEES, L_ANKLE, L_ELBOW, L_HIP, L_KNEE, L_SHOULDER, L_WRIST, PARENTS, SHOULDERS, TOES,
     WRISTS,
 )  # fmt: skip
-from magnet.export.palms import elbow_roll, palms_rolled
+from magnet.export.palms import bent_aside, elbow_roll, palms_rolled
 from magnet.export.rig import LIMBS, Skeleton
 from magnet.motion.rotations import from_rotvec
 from magnet.motion.scene import BODY_JOINTS
@@ -163,15 +163,9 @@ def _as_it_bends(skeleton: Skeleton, rest: Tensor, left: int, s: int) -> Tensor:
     """Where a thigh or an upper arm rests by how its hinge bends, (3, 3); NaN: it hardly does."""
     hinge, behind, way = BENDS[left]
     j, h, b = (joint + s for joint in (left, hinge, behind))
-    ours, theirs = skeleton.naming.joints, torch.from_numpy(skeleton.file.rest())
-    along = theirs[ours[h]] - theirs[ours[j]]
-    lower = torch.from_numpy(skeleton.at[:, ours[b]] - skeleton.at[:, ours[h]])
-    lower = (torch.from_numpy(skeleton.turned[:, skeleton.carrier(j)]).mT @ lower[..., None])[
-        ..., 0
-    ]  # as the upper bone rests
-    bends = _aside(lower, along).mean(dim=0)
+    along, bends = bent_aside(skeleton, j, h, b)
     if float(bends.norm()) < BENT:
-        return torch.full_like(theirs[:3], torch.nan)
+        return torch.full((3, 3), torch.nan, dtype=rest.dtype)
     ahead = torch.tensor([0.0, 0.0, way], dtype=rest.dtype)
     return _frame(along, bends) @ _frame(rest[h] - rest[j], ahead).mT
 
